@@ -4,6 +4,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from trade import Container
+
 PATIENCE_S = 60.0
 _LEAST_S = 0.002
 
@@ -21,3 +23,9 @@ def wait_until(true: Callable[[], object], what: str = "it happened") -> None:
         now = time.monotonic()
         assert now < deadline, f"waited {PATIENCE_S} s in vain until {what}"
         threading.Event().wait(max(_LEAST_S, 4 * (now - looked_at)))
+
+
+def wait_until_dialled(container: Container) -> None:
+    """Wait until the container dials no endpoint any more, and has warned of those that refuse it."""
+    dialer = container.reach
+    wait_until(lambda: not (dialer._has_work() or dialer._rounds._running), "it dials no more")

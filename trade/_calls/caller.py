@@ -17,7 +17,8 @@ from msgspec import Raw, structs
 
 from trade._calls.arguments import ArgumentEncoder
 from trade._calls.local_path import LocalPath, LocalSlot, LocalStarter
-from trade._calls.peer import CallPublishers, OnReply, Peer, Pending, ReplySlot, Route, Slot, ended
+from trade._calls.peer import CallPublishers, OnReply, Peer, Pending, ReplySlot, Route, ended
+from trade._calls.slot import Slot
 from trade._telemetry.spans import Spans
 from trade._threads.condition import InterruptibleCondition
 from trade._threads.scheduler import NEVER, Scheduler
@@ -209,30 +210,30 @@ class Caller:
     def _ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
         """The same on the transport."""
         try:
-            box = self._borrow()
+            slot = self._borrow()
         except ChannelClosed:
             return ended(call.id, Status.UNSENT)
         peer, publisher = route.peer, route.publisher
         try:
-            call.reply = box.name
+            call.reply = slot.name
             data = route.encode(call)
-            box.sent = (publisher, data)
-            self._wait_with(box, (call.id, peer, deadline_ns))
+            slot.sent = (publisher, data)
+            self._wait_with(slot, (call.id, peer, deadline_ns))
             if peer.lost or self._closed:
                 return ended(call.id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
             publisher.put(data)
-            return self._await_reply(box, call.id, peer, sent_ns)
+            return self._await_reply(slot, call.id, peer, sent_ns)
         except ChannelClosed:  # the publisher closed with its provider, or the whole container closes
             return ended(call.id, Status.UNSENT)
         finally:
-            box.waiting = box.sent = None
-            self._free.append(box)
+            slot.waiting = slot.sent = None
+            self._free.append(slot)
 
-    def _await_reply(self, box: ReplySlot, call_id: int, peer: Peer, sent_ns: int) -> Reply:
+    def _await_reply(self, slot: ReplySlot, call_id: int, peer: Peer, sent_ns: int) -> Reply:
         while True:
             try:
-                message = box.channel.receive()
+                message = slot.channel.receive()
             except ChannelClosed:
                 return ended(call_id, Status.CLOSED)
             reply = self._decode(message)
@@ -348,7 +349,7 @@ class Caller:
 
         The callee runs no id twice. Its clock is requested first, as it may have been suspended meanwhile.
         """
-        sent = [box.sent for box in list(self._every) if box.waiting is not None and box.waiting[1] is peer]
+        sent = [slot.sent for slot in list(self._every) if slot.waiting is not None and slot.waiting[1] is peer]
         started = [pending for pending in list(self._pending.values()) if pending.peer is peer]
         sent += [pending.sent for pending in started if pending.starter is None]
         due = [one for one in sent if one is not None]
@@ -379,7 +380,7 @@ class Caller:
         pending = self._pending.get(call_id)
         if pending is not None:
             return pending.deadline_ns
-        waiting = [box.waiting for box in list(self._every)]
+        waiting = [slot.waiting for slot in list(self._every)]
         return next((one[2] for one in waiting if one is not None and one[0] == call_id), None)
 
     def _finish(self, reply: Reply) -> None:
@@ -410,23 +411,23 @@ class Caller:
             key = reply_key("*", self.own.identity, self.own.container, index)
             own = reply_key(self.own.identity, self.own.identity, self.own.container, index)
             name = f"{self.own.container}/{index}"
-            box = ReplySlot(name, self._transport, own, self._transport.subscribe(key))
-            self._every.append(box)
-            return box
+            slot = ReplySlot(name, self._transport, own, self._transport.subscribe(key))
+            self._every.append(slot)
+            return slot
 
     def _shared_box(self) -> ReplySlot:
         if self._shared is None:
-            box = self._new_reply_slot()
+            slot = self._new_reply_slot()
             with self._lock:
                 if self._shared is None:
-                    self._shared = box
+                    self._shared = slot
                     try:
                         self._spawn("trade-replies", self._read_shared)
                     except RuntimeError:
                         self._shared = None
                         raise
-                    return box
-            self._free.append(box)
+                    return slot
+            self._free.append(slot)
         return self._shared
 
     def _read_shared(self) -> None:
@@ -481,7 +482,7 @@ class Caller:
         blocked = [call[2] for call, ended_id in waiting if call is not None and call[0] != ended_id]
         return min(blocked + [pending.deadline_ns for pending in list(self._pending.values())], default=NEVER)
 
-    def _end(self, meant: Callable[[Peer, float], bool], status: int) -> None:
+    def _end(self, meant: Callable[[object, float], bool], status: int) -> None:
         for slot in self._slots():
             waiting = slot.waiting
             if waiting is None:
@@ -515,7 +516,7 @@ class Caller:
             time.sleep(0.001)
 
     def _stopping(self) -> bool:
-        sent = [box.sent for box in list(self._every)] + [pending.sent for pending in list(self._pending.values())]
+        sent = [slot.sent for slot in list(self._every)] + [pending.sent for pending in list(self._pending.values())]
         local = () if self._local is None else list(self._local.slots)
         return any(one is not None and self.publishers.of_stops(one[0]) for one in sent) or any(
             slot.stops and slot.waiting is not None for slot in local
@@ -526,8 +527,8 @@ class Caller:
         self._closed = True
         self._end(lambda _peer, _deadline: True, Status.CLOSED)
         self._wait_until_free(time.monotonic() + _END_S)
-        for box in list(self._every):
-            box.channel.close()
+        for slot in list(self._every):
+            slot.channel.close()
         if self._local is not None:
             self._local.close()
         for peer in list(self._peers.values()):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from trade._calls.peer import Slot
+from trade._calls.slot import Slot
 from trade.errors import TradeError
 from trade.protocol.keys import LOCAL, Address
 from trade.transport.host_socket import dial_on_host, host_sockets

@@ -3,18 +3,17 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from msgspec import Struct
 
 from trade._calls.arguments import ArgumentEncoder
+from trade._calls.local_path import LocalPeer, LocalStarter
+from trade._calls.slot import Sent, Slot
 from trade._threads.scheduler import NEVER
 from trade.protocol.keys import Address, call_key
 from trade.protocol.messages import EMPTY, PROTOCOL, Call, Reply, encode_message
 from trade.transport.base import Channel, Publisher, Transport
-
-if TYPE_CHECKING:
-    from trade._calls.local_path import LocalPeer, LocalStarter
 
 _DRIFT: Final = 200e-6
 """The largest drift between two monotonic clocks (quartz is specified to 100 ppm)."""
@@ -23,7 +22,7 @@ _DRIFT: Final = 200e-6
 class Peer:
     """Another container as callers see it: whether it is reachable, and the offset of its clock."""
 
-    def __init__(self, address: Address, *, lost: bool = False, local: "LocalPeer | None" = None) -> None:
+    def __init__(self, address: Address, *, lost: bool = False, local: LocalPeer | None = None) -> None:
         self.address = address
         self.local = local
         """Connections to it on this host; None without the local path."""
@@ -88,31 +87,6 @@ class Route(Struct, frozen=True):
 
 OnReply = Callable[[Reply], None]
 
-Waiting = tuple[int, Peer, int]
-"""Call id, callee and deadline: replaced as a whole, so that a thread ends the same wait that it has examined."""
-
-
-Sent = tuple[Publisher, bytes]
-"""A sent message and its publisher, to send it again after a lost link."""
-
-
-class Slot:
-    """What one caller at a time borrows to wait for a reply."""
-
-    __slots__ = ("ended_id", "ended_status", "sent", "waiting")
-
-    def __init__(self) -> None:
-        self.waiting: Waiting | None = None
-        self.sent: Sent | None = None
-        """What was sent on the transport."""
-        self.ended_id = 0
-        """The last call whose wait this container ended itself."""
-        self.ended_status = 0
-
-    def end(self, call_id: int, status: int) -> None:
-        """Ends the wait for a call, from another thread."""
-        raise NotImplementedError
-
 
 class ReplySlot(Slot):
     """A reply channel that one caller at a time borrows."""
@@ -149,7 +123,7 @@ class Pending:
         on_reply: OnReply,
         on_progress: OnReply | None,
         sent: Sent,
-        starter: "LocalStarter | None" = None,
+        starter: LocalStarter | None = None,
         *,
         grants: bool = False,
     ) -> None:

@@ -34,7 +34,7 @@ class OwnServices(
             parts.locks,
             client.address,
             parts.ask_for_release,
-            parts.lock_api.lease_client.asked,
+            parts.lock_api.lease_client.release_requested,
             client.access,
             parts.providers.groups_of,
             parts.remote_locks,

@@ -75,9 +75,9 @@ class Dialer:
             if on and self._beacon is None:
                 self._beacon = self._links.beacon()
             elif not on:
-                self._dim()
+                self._end_beacon()
 
-    def _dim(self) -> None:
+    def _end_beacon(self) -> None:
         beacon, self._beacon = self._beacon, None
         if beacon is not None:
             beacon.close()
@@ -235,7 +235,7 @@ class Dialer:
         """Dial no more, and end the beacon. Idempotent."""
         with self._lock:
             self._closed = True
-            self._dim()
+            self._end_beacon()
         self._rounds.cancel(_END_S)
 
 

@@ -43,7 +43,7 @@ class LeaseClient:
     def owner(self) -> Address:
         return self._client.address
 
-    def over(self) -> bool:
+    def is_closed(self) -> bool:
         """Whether its container closes or is closed."""
         return self._closed
 
@@ -192,13 +192,13 @@ class LeaseClient:
             lock.drop(address)
             lock.lose(f"container {address.container} has ended or cannot be reached")
 
-    def asked(self, token: Token, who: str, reason: str) -> bool:
+    def release_requested(self, token: Token, client: str, reason: str) -> bool:
         """Takes a release request for a grant. Returns whether its owner handles requests."""
         with self._guard:
             found = next((lock for lock in self._locks if token in lock.granted.values()), None)
         if found is None or found.on_request is None:
             return False
-        in_own_thread(self.over, found.on_request, who, reason)
+        in_own_thread(self.is_closed, found.on_request, client, reason)
         return True
 
     def close(self) -> None:

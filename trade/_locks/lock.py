@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Generator, Iterable
 from contextvars import Token as Reset
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 from msgspec import structs
 
@@ -18,9 +18,7 @@ from trade._resources.grants import Granted, LockRequest
 from trade.errors import ConfigurationError, LockLost, TradeError
 from trade.protocol.keys import Address
 from trade.protocol.messages import Token
-
-if TYPE_CHECKING:
-    from trade._locks.lease_client import LeaseClient
+from trade.transport.wait_clock import WaitClock
 
 _logger = logging.getLogger("trade")
 
@@ -41,6 +39,32 @@ OnRequest = Callable[[str, str], object]
 """Called with the client that requests the lock's release, and its reason."""
 
 
+class LeaseHolder(Protocol):
+    """Takes, renews and gives back the leases of locks, for one container."""
+
+    @property
+    def owner(self) -> Address:
+        """The container."""
+        ...
+
+    @property
+    def clock(self) -> WaitClock:
+        """The clock of the leases."""
+        ...
+
+    def is_closed(self) -> bool:
+        """Whether the container closes or is closed."""
+        ...
+
+    def acquire(self, lock: "Lock", wanted: dict[Address, list[str]], terms: LockRequest) -> "Lock":
+        """Takes all or nothing."""
+        ...
+
+    def release(self, lock: "Lock", lost: str = "") -> bool:
+        """Gives the leases of a lock back, and renews them no more."""
+        ...
+
+
 class Lock:
     """Exclusive use of services; a context manager, also of asyncio. Only calls made inside it get through.
 
@@ -50,7 +74,7 @@ class Lock:
 
     def __init__(
         self,
-        keeper: "LeaseClient",
+        lease_client: LeaseHolder,
         terms: LockRequest,
         wanted: Wanted,
         on_lost: OnLost | None,
@@ -58,7 +82,7 @@ class Lock:
         claim: Claim,
         selection: str = "",
     ) -> None:
-        self._lease_client = keeper
+        self._lease_client = lease_client
         self._terms = terms
         self._wanted = wanted
         self._selection = selection
@@ -178,7 +202,7 @@ class Lock:
         try:
             await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.add_done_callback(lambda _: in_own_thread(self._lease_client.over, self.release))
+            taking.add_done_callback(lambda _: in_own_thread(self._lease_client.is_closed, self.release))
             raise
         return self._enter()
 
@@ -258,20 +282,20 @@ class Lock:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        in_own_thread(self._lease_client.over, self._lease_client.release, self, reason)
+        in_own_thread(self._lease_client.is_closed, self._lease_client.release, self, reason)
         if self._on_lost is not None:
-            in_own_thread(self._lease_client.over, self._on_lost, _again(self._lost))
+            in_own_thread(self._lease_client.is_closed, self._on_lost, _again(self._lost))
 
 
 def _again(lost: LockLost) -> LockLost:
     return LockLost(resources=lost.resources, reason=lost.reason)
 
 
-def in_own_thread(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
+def in_own_thread(closed: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
     """Calls a lock callback on another thread, so that no lock waits for it.
 
     Args:
-        over: whether the container closes; an error that this causes is not a failure.
+        closed: whether the container closes; an error that this causes is not a failure.
         call: the callback.
         arguments: its arguments.
     """
@@ -280,7 +304,7 @@ def in_own_thread(over: Callable[[], bool], call: Callable[..., object], *argume
         try:
             call(*arguments)
         except Exception as error:
-            if over() and isinstance(error, TradeError):
+            if closed() and isinstance(error, TradeError):
                 _logger.debug("the lock callback %r was cut off, because its container closed: %s", call, error)
             else:
                 _logger.exception("the lock callback %r failed", call)

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade.errors import InvalidArgument, ToleranceExceeded
-from trade_gateway.ros.to_ros._served_goals import Unacceptable
 from trade_gateway.ros_messages._conversion import ros_stamp, seconds
 from trade_gateway.ros_messages._joint_names import JointNames
 from trade_gateway.ros_messages._types import Message
@@ -24,6 +23,15 @@ AT_ONCE_S: Final = 1e-3
 """A first point before this time is rounding of 0, as in `trade_drivers`."""
 _CLOCKS_S: Final = 1.0
 """Greatest difference between the clock of a goal's sender and ours."""
+
+
+class Unacceptable(Exception):
+    """A goal that is refused before anything moves."""
+
+    def __init__(self, code: int, problem: str) -> None:
+        super().__init__(problem)
+        self.code = code
+        """The error code of its result, if the type has one."""
 
 
 def starts_late(goal: Message, now_s: float) -> None:

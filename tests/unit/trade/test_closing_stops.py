@@ -37,7 +37,7 @@ class Lift:
 def _close(container: Container, lift: Lift) -> threading.Thread:
     closing = threading.Thread(target=container.close)
     closing.start()
-    wait_until(container.lock_api.lease_client.over, "it closes")
+    wait_until(container.lock_api.lease_client.is_closed, "it closes")
     lift.closing.set()
     return closing
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.waiting import wait_until_dialled
 from trade import Container, Settings, service, where
 from trade.errors import CannotConnect, ConfigurationError, NoSuchService
 from trade.transport.credentials import user_secret
@@ -58,8 +59,7 @@ def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: 
     start_container("there", credentials=ALICE, listen=[endpoint])
     outsider = start_container("outsider", credentials=("alice", "wrong"), connect=[endpoint])
     with caplog.at_level(logging.WARNING, "trade"):
-        assert outsider.reach._thread is not None
-        outsider.reach._thread.join(20)  # it has nothing to do once this is settled
+        wait_until_dialled(outsider)
     assert f"no link was made in time (tried {endpoint.partition('/')[2]} (accepts connections" in caplog.text
     refused = r"\(accepts connections, but not this container\)\); a link takes the same user and password at both ends"
     with pytest.raises(CannotConnect, match=refused):
@@ -71,8 +71,7 @@ def test_an_endpoint_that_lets_us_in_is_not_warned_of(start_container: Any, capl
     start_container("there", listen=[endpoint])
     visitor = start_container("visitor", connect=[endpoint])
     with caplog.at_level(logging.WARNING, "trade"):
-        if visitor.reach._thread is not None:
-            visitor.reach._thread.join(20)
+        wait_until_dialled(visitor)
     assert caplog.text == ""
 
 

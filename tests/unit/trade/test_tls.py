@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from tests.support.certificates import Papers
 from tests.support.policies import policy_text
-from tests.support.waiting import wait_until
+from tests.support.waiting import wait_until, wait_until_dialled
 from trade import Container, Settings, service, where
 from trade._container import certificate_end
 from trade._security.certificates import Certificate
@@ -129,8 +129,7 @@ def test_an_endpoint_that_refuses_a_certificate_is_warned_of(
     start_container("there", tls=papers.of("arm"), listen=[endpoint])
     with caplog.at_level(logging.WARNING, "trade"):
         outsider = start_container("outsider", tls=strangers.of("arm"), connect=[endpoint])
-        assert outsider.reach._thread is not None
-        outsider.reach._thread.join(20)  # it has nothing to do once this is settled
+        wait_until_dialled(outsider)
     assert f"no link to {endpoint}: no link was made in time (tried " in caplog.text
     assert "a link takes certificates in date of one authority" in caplog.text
     with pytest.raises(CannotConnect, match="of one authority"):
@@ -144,8 +143,7 @@ def test_an_endpoint_that_takes_a_certificate_is_not_warned_of(
     start_container("there", tls=papers.of("arm"), listen=[endpoint])
     with caplog.at_level(logging.WARNING, "trade"):
         visitor = start_container("visitor", tls=papers.of("planner"), connect=[endpoint])
-        if visitor.reach._thread is not None:
-            visitor.reach._thread.join(20)
+        wait_until_dialled(visitor)
     assert caplog.text == ""
 
 
@@ -209,8 +207,7 @@ def is_linked(container: Container, name: str, expected: bool) -> None:
     if expected:
         wait_until(lambda: ("tls", name) in links(container), "they are linked")
     else:
-        assert container.reach._thread is not None
-        container.reach._thread.join(20)
+        wait_until_dialled(container)
         assert links(container) == []
 
 

@@ -13,16 +13,14 @@ from concurrent.futures import Future, InvalidStateError
 from concurrent.futures import TimeoutError as NotYet
 from concurrent.futures import wait as wait_for
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1._status import ENDED, Status, now
+from trade_gateway.ros.ros1._topics import Topics
 from trade_gateway.ros.ros1._wire import action_types
 from trade_gateway.ros_messages._types import Message
-
-if TYPE_CHECKING:
-    from trade_gateway.ros.ros1._ros1 import Ros1
 
 _THERE_S: Final = 5.0
 """Timeout for an action to appear at its client's first use."""
@@ -86,7 +84,7 @@ class _Goal:
 class ActionClient:
     """All goals of TRADE at one action; its topics stay open until `close`."""
 
-    def __init__(self, graph: "Ros1", name: str, type_name: str) -> None:
+    def __init__(self, graph: Topics, name: str, type_name: str) -> None:
         types = action_types(graph.types, type_name)
         self.type_name: Final = type_name
         self._graph = graph

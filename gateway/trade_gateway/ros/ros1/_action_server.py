@@ -10,16 +10,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
 from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
+from trade_gateway.ros.ros1._topics import Topics
 from trade_gateway.ros.ros1._wire import action_types
 from trade_gateway.ros_messages._types import Message
-
-if TYPE_CHECKING:
-    from trade_gateway.ros.ros1._ros1 import Ros1
 
 _EVERY_S: Final = 0.2
 _KEPT_S: Final = 5.0
@@ -84,7 +82,7 @@ class ActionServer:
     """Receives goals and runs them. See the module."""
 
     def __init__(
-        self, graph: "Ros1", name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None
+        self, graph: Topics, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None
     ) -> None:
         types = action_types(graph.types, type_name)
         self._name = name

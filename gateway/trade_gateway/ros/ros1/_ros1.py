@@ -28,6 +28,7 @@ from trade_gateway.ros.ros1._action_server import ActionServer
 from trade_gateway.ros.ros1._link import Link, Opened
 from trade_gateway.ros.ros1._node._frames import Head
 from trade_gateway.ros.ros1._service import Served
+from trade_gateway.ros.ros1._topics import HeardAt, PublishedTopic
 from trade_gateway.ros.ros1._wire import message_head, service_head
 from trade_gateway.ros_messages._types import Message, Types, installed_definitions
 
@@ -75,23 +76,8 @@ class Nodes:
 
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 _MASTER: Final = "http://localhost:11311"
-HeardAt = Callable[[Message, str, float], object]
-"""As `Heard`, also with the time of arrival by ``time.monotonic()``."""
 _NEWEST: Final = 10
 """Number of messages of a topic that wait in each queue."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Published:
-    types: Types
-    type_name: str
-    opened: Opened
-
-    def send(self, message: Mapping[str, Any]) -> None:
-        self.opened.send(self.types.to_bytes(self.type_name, message))
-
-    def close(self) -> None:
-        self.opened.close()
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +137,10 @@ class Ros1(Graph):
     def advertise(self, topic: str, type_name: str, *, latched: bool = False) -> Publisher:
         return self.publish(topic, type_name, latched=latched, most=_NEWEST)
 
-    def publish(self, topic: str, type_name: str, *, latched: bool, most: int) -> _Published:
+    def publish(self, topic: str, type_name: str, *, latched: bool, most: int) -> PublishedTopic:
         """As `advertise`; at most `most` messages wait, the newest ones."""
         head = self._topic("publish", topic, type_name)
-        return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
+        return PublishedTopic(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
     def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
         def came(message: Message, who: str, _: float) -> None:

@@ -11,11 +11,12 @@ import msgspec
 from trade import Constraint, Handle, where
 from trade.errors import ConfigurationError
 from trade_gateway.ros._file import ActionEntry, GripperEntry
+from trade_gateway.ros._goals import Unacceptable
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros.from_ros._sent_goals import TEXTS
-from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, Unacceptable
+from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals
 from trade_gateway.ros_messages._conversion import RequestMapping, ResponseMapping, failure, ros_stamp
 from trade_gateway.ros_messages._types import Message, Types
 

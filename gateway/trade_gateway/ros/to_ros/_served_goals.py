@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from trade import Handle, Run
 from trade.errors import SessionEnded
+from trade_gateway.ros._goals import Unacceptable
 from trade_gateway.ros._graph import Ended, Goal, Outcome
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros_messages._conversion import failure
@@ -19,15 +20,6 @@ _WAIT_S: Final = 2.0
 """Wait for a lock: the time in which a joint comes to rest."""
 _TURN_WITHIN_S: Final = 5.0
 _LATE_S: Final = 5.0
-
-
-class Unacceptable(Exception):
-    """A goal that is refused before anything moves."""
-
-    def __init__(self, code: int, problem: str) -> None:
-        super().__init__(problem)
-        self.code = code
-        """The error code of its result, if the type has one."""
 
 
 class CallOfGoal(NamedTuple):
