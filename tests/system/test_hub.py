@@ -51,6 +51,7 @@ def test_S05_if_the_hub_is_killed_a_motion_ends_and_an_estop_arrives_without_it(
     hub.wait()
     begun(run)
     wait_until(lambda: len(trade.containers()) == 3, "all see each other again")
+    wait_until(lambda: trade.services(TILT), "they know each other's services, which come after the containers")
     with pytest.raises(Stopped):
         tilt(0.1)
     assert trade_command("estop", "--clear").returncode == 0
