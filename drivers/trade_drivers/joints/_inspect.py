@@ -1,13 +1,11 @@
 """Checks of a robot file for joints of all vendors."""
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.joints._axis import Axis, AxisT
-
-if TYPE_CHECKING:
-    from trade_robotfile import Bus
+from trade_robotfile import Bus
 
 _BRAKING_S: Final = 1.5
 
@@ -51,7 +49,7 @@ def check_least(axis: Axis, least: str) -> None:
             raise Unfit(f"{value:.3g} is below {count:.3g}, {least}", key)
 
 
-def check_rate(bus: "Bus", where: str, times: int) -> None:
+def check_rate(bus: Bus, where: str, times: int) -> None:
     """Raises ``ConfigurationError`` for a rate with too few cycles before a watchdog expires."""
     least_hz = times / min(bus.watchdog_s, bus.stale_after_s)
     if bus.rate_hz < least_hz:

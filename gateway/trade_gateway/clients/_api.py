@@ -36,6 +36,7 @@ from trade_gateway.clients._administration import Administration
 from trade_gateway.clients._authorizer import ClientAuthorizer
 from trade_gateway.clients._clients import MOST_CALLS, Client, Clients, Quota, places
 from trade_gateway.clients._configuration import Configuration
+from trade_gateway.clients._notification_forwarder import NotificationForwarder
 from trade_gateway.clients._system_info import Overview
 
 _logger = logging.getLogger("trade")
@@ -376,27 +377,9 @@ class ClientApi:
                 "changed": here.changed,
             }
             return [
-                kinds[one](wanted, _Notified(client, one, self.judge, callback).hear)
+                kinds[one](wanted, NotificationForwarder(client, one, self.judge, callback).hear)
                 for one in dict.fromkeys(request.occasions)
             ]
-
-
-class _Notified:
-    """Forwards notifications of services to a client, if it may know of them."""
-
-    def __init__(
-        self, client: Client, occasion: str, judge: ClientAuthorizer, callback: Callable[[str, Handle], object]
-    ) -> None:
-        self._client = client
-        self._occasion = occasion
-        self._judge = judge
-        self._tell = callback
-        self.target_text = f"notify {client.identity} (a client of the HTTP gateway)"
-        """Its text in lists of notifications."""
-
-    def hear(self, handle: Handle) -> None:
-        if self._judge.sees(self._client.identity, handle):
-            self._tell(self._occasion, handle)
 
 
 def _wanted(group: str | None, name: str | None) -> Constraint:

@@ -1,7 +1,8 @@
 """The HTTP gateway: HTTP and WebSocket for clients without TRADE (the extra ``http``)."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
+
+from trade_gateway._lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from trade_gateway.http._authentication import Tokens, add_token
@@ -9,15 +10,12 @@ if TYPE_CHECKING:
 
 __all__ = ["HttpGateway", "Tokens", "add_token"]
 
-_PLACES: Final = {
-    "Tokens": "_authentication",
-    "add_token": "_authentication",
-    "HttpGateway": "_server",
-}
-"""The modules of these names; they need the extra ``http``, which the command line is installed without."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(name)
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+# their modules need the extra `http`, which the command line is installed without
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Tokens": "_authentication",
+        "add_token": "_authentication",
+        "HttpGateway": "_server",
+    },
+)

@@ -6,7 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import can
 
@@ -20,9 +20,7 @@ from trade_drivers.bus.can._netlink import look_at
 from trade_drivers.bus.can._send_queue import LONGEST_S, SendQueue, is_full
 from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.bus.can._socketcand import ServerBus
-
-if TYPE_CHECKING:
-    from trade_robotfile import CanBus
+from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of each split frame
@@ -105,7 +103,7 @@ class CanPort:
         self._was_full = False
 
     @classmethod
-    def of(cls, path: str, bus: "CanBus", where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
+    def of(cls, path: str, bus: CanBus, where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
         """Returns a port for a driver: it listens for as long as watchdogs take.
 
         A device that has torque after that is fed by another driver, or has no watchdog.

@@ -10,10 +10,10 @@ from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
 from trade_drivers.joints import Exchange, Steps, Unfit, next_measurement
 from trade_drivers.joints.can._axis import MotorAxis
+from trade_robotfile import CanBus, Joint
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_robotfile import CanBus, Joint
 
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25
@@ -29,7 +29,7 @@ _Axis = TypeVar("_Axis", bound=MotorAxis)
 class MotorExchange(Exchange[_Axis]):
     """The exchange with the motors of one CAN bus."""
 
-    axis_type: ClassVar[Callable[[str, str, "Joint", float, Sequence[str]], Any]]
+    axis_type: ClassVar[Callable[[str, str, Joint, float, Sequence[str]], Any]]
     """Makes the state of a motor: its name, port, table in the robot file, cycles per second, and coupled joints."""
     silent_after_ns: int
     """A motor without any frame for this time is left out."""
@@ -37,7 +37,7 @@ class MotorExchange(Exchange[_Axis]):
     """The pause before an offline motor is tried again."""
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[_Axis], clock: Callable[[], int] | None = None
+        self, port: "CanPort", bus: CanBus, axes: Sequence[_Axis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(bus, axes, clock)
         self.port = port
@@ -55,7 +55,7 @@ class MotorExchange(Exchange[_Axis]):
 
     @staticmethod
     @abstractmethod
-    def check_bus(bus: "CanBus", axes: Sequence[Any], where: str) -> None:
+    def check_bus(bus: CanBus, axes: Sequence[Any], where: str) -> None:
         """Checks the robot file: keys, limits, and whether a cycle is long enough for its frames.
 
         Raises:

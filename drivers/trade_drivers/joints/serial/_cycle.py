@@ -11,10 +11,10 @@ from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Exchange, Motion, Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
+from trade_robotfile import SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_robotfile import SerialBus
 
 _log = logging.getLogger("trade")
 _HEALTH_NS: Final = 500_000_000
@@ -41,7 +41,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
     def __init__(
         self,
         wire: _Wire_co,
-        bus: "SerialBus",
+        bus: SerialBus,
         axes: Sequence[_Servo],
         clock: Callable[[], int] | None = None,
     ) -> None:

@@ -9,10 +9,10 @@ from trade_drivers.bus._attempts import ATTEMPTS, attempts
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Unfit, check_least, check_rate
 from trade_drivers.joints.serial._axis import ServoAxis
+from trade_robotfile import SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_robotfile import SerialBus
 
 _Result = TypeVar("_Result")
 
@@ -45,7 +45,7 @@ def _check_turn(axis: ServoAxis[Any]) -> None:
     raise Unfit(problem, key)
 
 
-def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> None:
+def check_cycle(bus: SerialBus, count: int, cycle_bytes: int, where: str) -> None:
     """Checks that cycles are frequent enough and long enough for their bytes.
 
     Raises:
@@ -60,7 +60,7 @@ def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> N
 
 def first_ping(
     wire: "ServoWire",
-    bus: "SerialBus",
+    bus: SerialBus,
     axis: ServoAxis[Any],
     clock_ns: Callable[[], int],
     key: str,
@@ -100,7 +100,7 @@ def first_ping(
 
 def again(
     wire: "ServoWire",
-    bus: "SerialBus",
+    bus: SerialBus,
     axis: ServoAxis[Any],
     clock_ns: Callable[[], int],
     act: Callable[[], _Result],
@@ -146,7 +146,7 @@ def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
 
 
 def first_look(
-    wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], kept: Kept, clock_ns: Callable[[], int], key: str
+    wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], kept: Kept, clock_ns: Callable[[], int], key: str
 ) -> bytes:
     """Checks that a joint's device is that of the robot file, and takes its first measurements.
 

@@ -14,10 +14,10 @@ from trade_drivers.vendors.cia402._axis import DriveAxis, Following, Stage, Turn
 from trade_drivers.vendors.cia402._table import Entry, State
 from trade_drivers.vendors.cia402._verify import Admission, check_bus, heartbeat_ms
 from trade_drivers.vendors.cia402._wire import Net, NoAnswer, Refused
+from trade_robotfile import CanBus
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
@@ -38,7 +38,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
     again_ns = PROBE_NS
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] | None = None
+        self, port: "CanPort", bus: CanBus, axes: Sequence[DriveAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.nodes = Net(self.net)

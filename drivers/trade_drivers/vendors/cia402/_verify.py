@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.bus._cycle import PROBE_NS
@@ -15,9 +15,7 @@ from trade_drivers.vendors.cia402._axis import DriveAxis, Stage
 from trade_drivers.vendors.cia402._table import Entry, Pdo, State, state_of
 from trade_drivers.vendors.cia402._units import check_units, read_optional
 from trade_drivers.vendors.cia402._wire import Answer, Net, NoAnswer, Refused
-
-if TYPE_CHECKING:
-    from trade_robotfile import CanBus
+from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _QUICK_STOP: Final = 3
@@ -31,7 +29,7 @@ _UNHEARD_NS: Final = 2_000_000_000
 """The wait for a drive's frames after set-up, before it is set up again."""
 
 
-def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
+def check_bus(bus: CanBus, axes: Sequence[DriveAxis], where: str) -> None:
     """Checks the robot file: node numbers, counts, speeds, and whether a cycle is long enough for its frames.
 
     Raises:
@@ -61,12 +59,12 @@ def _check_joint(axis: DriveAxis) -> None:
     check_least(axis, "one count of its encoder")
 
 
-def motion_every(bus: "CanBus") -> int:
+def motion_every(bus: CanBus) -> int:
     """Returns the number of SYNCs per second TPDO of a drive."""
     return max(1, min(240, round(bus.rate_hz / 100)))
 
 
-def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+def set_up(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
     """Checks a drive's identity, arms its watchdog and maps its frames; stops a motion that no client owns.
 
     Makes about seventy requests, one at a time; yields while it waits for answers.
@@ -171,7 +169,7 @@ def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     yield from net.write(axis.id, table.CONTROLWORD, table.QUICK_STOP)
 
 
-def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+def _arm(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
     for entry, value in (
         (table.ABORT_CONNECTION, _QUICK_STOP),
         (table.CONSUMER_HEARTBEAT, table.OUR_NODE << 16 | round(bus.watchdog_s * 1e3)),
@@ -199,7 +197,7 @@ def _map_first(net: Net, axis: DriveAxis) -> Steps:
         yield from _map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
 
 
-def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+def _map_streams(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
     """Sets up the optional modes without a goal; a drive that lacks something for them is used without them."""
     if (yield from _read(net, axis.id, table.QUICK_STOP_OPTION)) not in table.STANDING:
         axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
@@ -222,7 +220,7 @@ def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
         yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
 
 
-def heartbeat_ms(bus: "CanBus") -> int:
+def heartbeat_ms(bus: CanBus) -> int:
     """Returns a drive's heartbeat interval: a third of the allowed time."""
     return max(10, round(bus.stale_after_s * 1e3 / 3))
 
@@ -286,7 +284,7 @@ class Admission:
         exchange: MotorExchange[DriveAxis],
         net: Net,
         axis: DriveAxis,
-        bus: "CanBus",
+        bus: CanBus,
         beat_next: Callable[[], None],
     ) -> None:
         self.axis = axis

@@ -32,10 +32,10 @@ from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _table as table
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._table import Register
+from trade_robotfile import CanBus
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_robotfile import CanBus
 
 _LAG: Final = 5
 """Cycles by which a motor may lag behind its set-point."""
@@ -44,7 +44,7 @@ _WITHIN: Final = 0.98
 """The share of a motor's position range that a joint may use, as positions at its two ends look alike."""
 
 
-def check_bus(bus: "CanBus", axes: Sequence[DamiaoAxis], where: str) -> None:
+def check_bus(bus: CanBus, axes: Sequence[DamiaoAxis], where: str) -> None:
     """Checks the robot file: identifiers, keys, ranges, and whether a cycle is long enough for its frames.
 
     Raises:
@@ -77,7 +77,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     check_bus = staticmethod(check_bus)
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] | None = None
+        self, port: "CanPort", bus: CanBus, axes: Sequence[DamiaoAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.timeout = round(bus.watchdog_s * table.TICKS_PER_S)

@@ -9,10 +9,10 @@ from trade_drivers.joints import Gate, Goal, Steps, Work
 from trade_drivers.joints.serial import NoAnswer, ServoExchange, check_own_range
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis, DynamixelHealth
+from trade_robotfile import SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._wire import Wire
-    from trade_robotfile import SerialBus
 
 _SIZES: Final = tuple(
     register.end - CYCLIC[0]
@@ -39,7 +39,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
     def __init__(
         self,
         wire: "Wire",
-        bus: "SerialBus",
+        bus: SerialBus,
         axes: Sequence[DynamixelAxis],
         clock: Callable[[], int] | None = None,
     ) -> None:

@@ -14,10 +14,10 @@ from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._axis import COUNTS_PER_TURN, OdriveAxis
 from trade_drivers.vendors.odrive._frames import frame_id
 from trade_drivers.vendors.odrive._table import NODES, ORDERS, Command, Control, Errors, Input, State
+from trade_robotfile import CanBus
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)
@@ -35,7 +35,7 @@ _STREAM_HZ: Final = 100
 """Unrequested estimates per second by default."""
 
 
-def check_bus(bus: "CanBus", axes: Sequence[OdriveAxis], where: str) -> None:
+def check_bus(bus: CanBus, axes: Sequence[OdriveAxis], where: str) -> None:
     """Checks the robot file: node numbers, keys, speeds, and whether a cycle is long enough for its frames.
 
     Raises:
@@ -71,7 +71,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     check_bus = staticmethod(check_bus)
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] | None = None
+        self, port: "CanPort", bus: CanBus, axes: Sequence[OdriveAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.silent_after_ns = max(_BEATS_MISSED_NS, self.stale_after_ns)

@@ -16,10 +16,10 @@ from trade_drivers.bus._jobs import Device, Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper import GripperDevice, GripperMotion
 from trade_drivers.vendors.robotiq._table import Contact, Status
+from trade_robotfile import SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
-    from trade_robotfile import SerialBus
 
 _log = logging.getLogger("trade")
 _OUTDATED_NS: Final = 15_000_000
@@ -36,7 +36,7 @@ class Exchange(BusCycle[GripperDevice]):
     """The exchange with the grippers of one bus. Any thread may also call ``stop``."""
 
     def __init__(
-        self, wire: "Wire", bus: "SerialBus", devices: Sequence[GripperDevice], clock: Callable[[], int] | None = None
+        self, wire: "Wire", bus: SerialBus, devices: Sequence[GripperDevice], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(bus, devices, clock)
         self.wire = wire
