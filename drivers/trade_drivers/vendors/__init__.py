@@ -2,5 +2,5 @@
 
 ``_table`` has the registers and models as data, ``_wire`` makes and reads the bytes, ``_axis`` has a joint's state,
 ``_exchange`` runs the cycles and jobs of a bus, ``_driver`` attaches, checks, scans and sets devices up. ``_frames``
-stands in place of ``_wire`` where a CAN adapter has the line. CiA 402 and UR have further files.
+replaces ``_wire`` where a CAN adapter has the line. CiA 402 and UR have further files.
 """
