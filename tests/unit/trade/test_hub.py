@@ -117,8 +117,9 @@ def test_calls_between_attached_containers_do_not_pass_through_the_hub(
         for number in range(10):
             move(number)
     assert joint.moves == list(range(10))
-    heard = list(iter(tapped.try_recv, None))
-    assert bool(heard) == passes
+    if passes:
+        tapped.recv()  # which waits: the hub may pass a call on before its own tap has it
+    assert tapped.try_recv() is None or passes
     tapped.undeclare()
 
 
@@ -246,7 +247,7 @@ def test_no_attached_container_speaks_as_another_identity(certified: Callable[..
     assert [links(one).hub for one in (arm, planner, mallory)] == [links(door)._main_endpoint()] * 3
     tapped = heard_session.declare_subscriber("call/**", zenoh.handlers.FifoChannel(1000))
     assert find(planner, "move")(1) == 1
-    heard = [str(sample.key_expr) for sample in iter(tapped.try_recv, None)]
+    heard = (str(sample.key_expr) for sample in tapped)  # which waits: the answer may be here first
     key = next(key for key in heard if key.startswith("call/planner/") and "/robot" in key)
     sends = mallory._parts.transport
     sends.announce(key, b"forged")
