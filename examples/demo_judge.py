@@ -13,13 +13,13 @@ from demo_actor import PATIENCE_S, DemoFailed
 from demo_stage import ROBOT
 
 import trade_drivers
-from trade_hil_sim import Entry, SimControl, events, frames, motion_writes, read_log
+from trade_hil_sim import LogEntry, SimControl, events, frames, motion_writes, read_log
 
 AGREE_RAD = 0.02
 """A servo's own dead band is about a tenth of this."""
 PAN = "neck.pan"
 
-_LINES = msgspec.json.Decoder(Entry)
+_LINES = msgspec.json.Decoder(LogEntry)
 _T = TypeVar("_T")
 
 
@@ -31,13 +31,13 @@ class Judge:
         self._robot = trade_drivers.load(ROBOT)
         self._read = 0
         """Bytes of the log from which the events have been taken."""
-        self._events: list[Entry] = []
+        self._events: list[LogEntry] = []
 
-    def rests(self, joint: str, since: float) -> list[Entry]:
+    def rests(self, joint: str, since: float) -> list[LogEntry]:
         """Each time a joint came to rest."""
         return [entry for entry in events(self._so_far(), "at_rest", since=since) if entry.joint == joint]
 
-    def moves(self, joint: str, since: float) -> list[Entry]:
+    def moves(self, joint: str, since: float) -> list[LogEntry]:
         """Each time it began to move."""
         return [entry for entry in events(self._so_far(), "motion_started", since=since) if entry.joint == joint]
 
@@ -46,7 +46,7 @@ class Judge:
         own = [entry.name for entry in self._so_far() if entry.joint == joint]
         return next((name for name in reversed(own) if name in {"motion_started", "at_rest"}), "") == "motion_started"
 
-    def _so_far(self) -> list[Entry]:
+    def _so_far(self) -> list[LogEntry]:
         """All events; only what is new is read, since a bus of drives writes thousands of lines a second."""
         with self._log.open("rb") as log:
             log.seek(self._read)

@@ -17,7 +17,7 @@ from trade._calls.find_types import Afind as _Afind
 from trade._calls.find_types import Find as _Find
 from trade._calls.find_types import FindRobot as _FindRobot
 from trade._calls.group_view import GroupView
-from trade._calls.handle import Bound, Handle, handle_of, start_call
+from trade._calls.handle import BoundCall, Handle, handle_of, start_call
 from trade._calls.reachability import Reachability
 from trade._calls.run import Run
 from trade._container.container import Container
@@ -58,7 +58,7 @@ from trade.protocol.schema_types import publish as _publish
 from trade.stop_line import StopReport
 
 __all__ = [
-    "Bound",
+    "BoundCall",
     "CallContext",
     "CallDeviation",
     "CallModel",

@@ -5,8 +5,8 @@ from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._robot_file import load, parse, without
 from trade_drivers.bus._can_monitor import CanBusState, CanMonitor
 from trade_drivers.bus._jobs import WireError
-from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found, scan
-from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Trouble
+from trade_drivers.commissioning._commissioner import Bench, Commissioner, ScannedDevice, scan
+from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, FaultUpdate
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
 from trade_drivers.interfaces._polled_sensor import Measured, PolledSensor
@@ -39,8 +39,8 @@ __all__ = [
     "FaultInfo",
     "FaultLog",
     "FaultSample",
+    "FaultUpdate",
     "FollowProgress",
-    "Found",
     "Gripper",
     "GripperLimits",
     "GripperState",
@@ -56,6 +56,7 @@ __all__ = [
     "PolledSensor",
     "Reading",
     "Robot",
+    "ScannedDevice",
     "SenseDriver",
     "Sensor",
     "SensorInfo",
@@ -63,7 +64,6 @@ __all__ = [
     "Tolerances",
     "Trajectory",
     "TrajectoryPoint",
-    "Trouble",
     "UrBus",
     "WireError",
     "attach",

@@ -98,9 +98,9 @@ class AttachedRobot:
         """After close(): returns the devices that were not seen at rest when the driver left them. Check them."""
         return [name for bus in self._buses.values() for name in bus.unseen()]
 
-    def _provider(self, name: str, kind: type[_Provider]) -> _Provider:
+    def _provider(self, name: str, type_: type[_Provider]) -> _Provider:
         provider = self.providers[f"{self.robot.name}.{name}"]
-        if not isinstance(provider, kind):
+        if not isinstance(provider, type_):
             raise KeyError(name)
         return provider
 

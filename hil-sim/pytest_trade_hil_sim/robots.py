@@ -15,7 +15,7 @@ from trade.errors import ConfigurationError, DeviceError
 from trade.testing import MemorySystem, VirtualTime, VirtualTimeError, memory_system
 from trade_drivers import AttachedRobot, Robot, attach, load
 from trade_drivers.plugins._validate import own_clocks
-from trade_hil_sim import Command, Entry, SimControl, SimProcess, SimThreads, SimulationError, remove_leftovers
+from trade_hil_sim import Command, LogEntry, SimControl, SimProcess, SimThreads, SimulationError, remove_leftovers
 from trade_hil_sim.control._command_line import command_of
 from trade_hil_sim.control._server import State
 
@@ -49,7 +49,7 @@ class SimulatedRobot:
         """Injects faults, and knows the actual state of the devices."""
         return self.sim.control
 
-    def log(self) -> list[Entry]:
+    def log(self) -> list[LogEntry]:
         """Returns the bytes on all buses so far; `motion_writes` and its like of ``trade_hil_sim`` query them."""
         return self.sim.entries()
 

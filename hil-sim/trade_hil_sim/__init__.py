@@ -38,7 +38,7 @@ from trade_hil_sim.faults._commands import (
     Unplug,
     WrongModel,
 )
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.log._queries import (
     Span,
     events,
@@ -80,7 +80,6 @@ __all__ = [
     "DynamixelBus",
     "Echo",
     "Emergency",
-    "Entry",
     "Frame",
     "Freeze",
     "Garbage",
@@ -92,6 +91,7 @@ __all__ = [
     "Jam",
     "Late",
     "Local",
+    "LogEntry",
     "Mute",
     "Peer",
     "Place",

@@ -12,7 +12,7 @@ from statistics import median
 
 from tests.bench._report import keep_point, print_skipped, print_target
 from trade_drivers import Arm, Trajectory, TrajectoryPoint, attach, load
-from trade_hil_sim import Entry, SimProcess, instructions
+from trade_hil_sim import LogEntry, SimProcess, instructions
 
 _ROBOT = Path(__file__).parents[2] / "examples" / "arm.toml"
 _WAY_RAD = 0.3
@@ -82,7 +82,7 @@ def _bare(sim: SimProcess, seconds: float) -> float:
     return _rate(instructions(sim.entries(), "servo_j", since=mark))
 
 
-def _rate(stream: list[Entry]) -> float:
+def _rate(stream: list[LogEntry]) -> float:
     return (len(stream) - 1) / (stream[-1].t - stream[0].t)
 
 

@@ -90,10 +90,10 @@ def _measure_calls(folder: str, n: int, rounds: int) -> dict[str, list[tuple[flo
 def _measure_rate(folder: str, seconds: float) -> tuple[float, int, float]:
     """Records a second that were written, those lost, and per cent of a core."""
     from trade._audit.events import Event
-    from trade._audit.store import Keep
+    from trade._audit.store import Retention
     from trade._audit.writer import AuditWriter
 
-    writer = AuditWriter(Path(folder) / "rate.sqlite", "bench", "", Keep(90, 10_000_000))
+    writer = AuditWriter(Path(folder) / "rate.sqlite", "bench", "", Retention(90, 10_000_000))
     event = Event(time.time_ns(), 1, "call", "rosie.arm.reach", "", "anna", "anna/mind/1", 7, 3, "ok", "", 5)
     cpu_s, began, reported = time.process_time(), time.monotonic(), 0
     while (gone_s := time.monotonic() - began) < seconds:

@@ -103,7 +103,7 @@ def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list
             exchange = Cia402Driver().open_exchange(robot, bus, sim.ports["legs"])
             if tpdos == 2:
                 for axis in exchange.devices:
-                    every_sync = table.Entry(table.MOTION.communication, "u1", 2)
+                    every_sync = table.DictionaryEntry(table.MOTION.communication, "u1", 2)
                     for _ in exchange.nodes.write(axis.id, every_sync, table.AT_NEXT_SYNC):
                         exchange.net.take_in(_WAIT_S)
             began, took, cycle = list[float](), list[float](), exchange.cycle

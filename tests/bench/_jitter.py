@@ -30,7 +30,7 @@ from tests.bench._record import Histogram
 from tests.bench._report import keep_point, print_skipped
 from trade_drivers import load_driver
 from trade_drivers.plugins._driver import Driver
-from trade_hil_sim import Entry, SimProcess, SimulationError, read_log
+from trade_hil_sim import LogEntry, SimProcess, SimulationError, read_log
 
 EDGES_US: Final = (*(step * 10.0**decade for decade in range(1, 5) for step in (1, 2, 5)), 1e5)
 """Of the histograms, on either side of zero: two runs that are compared have the same ones."""
@@ -122,7 +122,7 @@ class Bus:
         """The robot file."""
         return _HEAD.format(driver=self.driver, rate_hz=self.rate_hz) + self.rest
 
-    def begins_cycle(self, entry: Entry) -> bool:
+    def begins_cycle(self, entry: LogEntry) -> bool:
         asked = entry.kind == "instruction" or (entry.kind == "frame" and entry.direction == "in")
         return asked and entry.name in self.marks and self.device_id in (None, entry.device_id)
 

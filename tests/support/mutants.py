@@ -183,10 +183,10 @@ def _discovery_never(patch: Patch) -> None:
 
 def _no_question(patch: Patch) -> None:
     """Orders in sentences are carried out without a confirmation."""
-    from trade_gateway.language._dialogue import Talk
+    from trade_gateway.language._dialogue import Dialogue
 
-    say = Talk.say
-    patch(Talk, "say", lambda self, sentence, **terms: say(self, sentence, **{**terms, "confirmed": True}))
+    say = Dialogue.say
+    patch(Dialogue, "say", lambda self, sentence, **terms: say(self, sentence, **{**terms, "confirmed": True}))
 
 
 def _rules_without_if(patch: Patch) -> None:

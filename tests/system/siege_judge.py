@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from tests.support.lock_log import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 from tests.system.siege_records import CAN_BUS, Alarm, Answer, AnyRecord, Fault, Order, Rescue, whole
-from trade_hil_sim import Entry
+from trade_hil_sim import LogEntry
 
 STOPS_S = 6.0
 """A joint whose client, driver or network is gone for longer than that rests: three of the transport's leases."""
@@ -56,7 +56,7 @@ class Motion(NamedTuple):
         return abs(self.counts - self.at)
 
 
-def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> Verdict:
+def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[LogEntry]]) -> Verdict:
     """Look for two owners, and for motions that no client ordered that came twice, late, without a lock or without end.
 
     Args:
@@ -87,7 +87,7 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
     return verdict
 
 
-def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
+def motions_of(entries: Iterable[LogEntry]) -> dict[str, list[Motion]]:
     """By joint, what it did: it reports starts and rest; on its way, its commands count.
 
     Who comes to rest after a goal has come and before it reads it sets off for it later: that is the same motion.
@@ -134,7 +134,7 @@ class Drive:
         self._unread = False
         """See `motions_of`."""
 
-    def take(self, entry: Entry, of: list[Motion]) -> None:
+    def take(self, entry: LogEntry, of: list[Motion]) -> None:
         """Add to its motions what an entry of its log says."""
         going, at = bool(of) and of[-1].rests == inf, (entry.position_counts or 0) + _CENTRE
         match entry.kind, entry.name:
@@ -168,7 +168,7 @@ def _stops(word: int) -> bool:
     return bool(word & _HALT) or word & (_QUICK_STOP | _NO_QUICK_STOP) == _QUICK_STOP
 
 
-def _written(entry: Entry, address: int) -> int | None:
+def _written(entry: LogEntry, address: int) -> int | None:
     at = address - (entry.address or 0)
     return int.from_bytes(entry.data[at : at + 4], "little", signed=True) if 0 <= at <= len(entry.data) - 4 else None
 

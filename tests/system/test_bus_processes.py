@@ -14,7 +14,7 @@ import trade
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import Bench, Program, at_ports
 from trade import Handle, where
-from trade_hil_sim import Entry, SimProcess, events, motion_writes
+from trade_hil_sim import LogEntry, SimProcess, events, motion_writes
 
 SIDES = ("left", "right")
 ROBOT = """
@@ -72,7 +72,7 @@ def set_off(bench: Bench, side: str) -> float:
     return float(events(on(bench, side), "motion_started")[-1].t)
 
 
-def on(bench: Bench, side: str) -> list[Entry]:
+def on(bench: Bench, side: str) -> list[LogEntry]:
     return [entry for entry in bench.sim.entries() if entry.bus == side]
 
 

@@ -18,7 +18,7 @@ from tests.system.siege import TROUBLES, Stand, stand
 from tests.system.siege_judge import judge, motions_of
 from tests.system.siege_minimised import fewest
 from tests.system.siege_records import Alarm, Answer, AnyRecord, Fault, Order, Rescue
-from trade_hil_sim import Entry
+from trade_hil_sim import LogEntry
 
 SECONDS = 60 * float(os.environ.get("SIEGE_MINUTES", "0.4"))
 SEED = int(os.environ.get("SEED", "1"))
@@ -66,8 +66,8 @@ def test_nothing_moves_that_must_not_whatever_faults_occur(besieged: Stand) -> N
     assert count["held back"] > 0 or "delay" not in KINDS
 
 
-def begun(t: float, counts: int, since: int = 2048) -> Entry:
-    return Entry(
+def begun(t: float, counts: int, since: int = 2048) -> LogEntry:
+    return LogEntry(
         t=t,
         bus="neck",
         kind="event",
@@ -78,9 +78,9 @@ def begun(t: float, counts: int, since: int = 2048) -> Entry:
     )
 
 
-def reported(t: float, counts: int, at: int, speed: int = 83) -> Entry:
+def reported(t: float, counts: int, at: int, speed: int = 83) -> LogEntry:
     """A goal, with its profile: acceleration, velocity, position."""
-    return Entry(
+    return LogEntry(
         t=t,
         bus="neck",
         kind="instruction",
@@ -93,8 +93,8 @@ def reported(t: float, counts: int, at: int, speed: int = 83) -> Entry:
     )
 
 
-def rest(t: float) -> Entry:
-    return Entry(t=t, bus="b", kind="event", name="at_rest", joint="pan", position_counts=0)
+def rest(t: float) -> LogEntry:
+    return LogEntry(t=t, bus="b", kind="event", name="at_rest", joint="pan", position_counts=0)
 
 
 HOLD = (Ask(t=0, hold="a:1", resources=("rosie.pan",)), Held(t=1, hold="a:1"), Seen(t=8, hold="a:1"))
@@ -187,7 +187,7 @@ STOP = 104
         (JOG, [begun(3, 2961), rest(6)], "which was to hold for 0.2 s"),
     ],
 )
-def test_the_judge_knows_what_is_wrong(records: tuple[Any, ...], entries: list[Entry], says: str) -> None:
+def test_the_judge_knows_what_is_wrong(records: tuple[Any, ...], entries: list[LogEntry], says: str) -> None:
     found = judge(records, {"rosie": entries}).violations
     if says:
         assert any(says in violation for violation in found), found
@@ -209,9 +209,9 @@ def test_motions_are_derived_from_commands_and_device_events() -> None:
     assert two.far == 801
 
 
-def commanded(t: float, word: int, counts: int, at: int) -> Entry:
+def commanded(t: float, word: int, counts: int, at: int) -> LogEntry:
     """A drive's first RPDO."""
-    return Entry(
+    return LogEntry(
         t=t,
         bus="leg",
         kind="instruction",
@@ -223,8 +223,8 @@ def commanded(t: float, word: int, counts: int, at: int) -> Entry:
     )
 
 
-def drive_says(t: float, name: str, at: int) -> Entry:
-    return Entry(t=t, bus="leg", kind="event", name=name, joint="leg.hip", position_counts=at)
+def drive_says(t: float, name: str, at: int) -> LogEntry:
+    return LogEntry(t=t, bus="leg", kind="event", name=name, joint="leg.hip", position_counts=at)
 
 
 def test_a_device_at_rest_before_it_has_read_its_next_goal_starts_once_for_that_goal() -> None:

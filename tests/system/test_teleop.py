@@ -14,7 +14,7 @@ from tests.support.simulated_robots import at_rest
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import ROOT, Bench, Program
 from trade import where
-from trade_hil_sim import Entry, events, motion_writes
+from trade_hil_sim import LogEntry, events, motion_writes
 
 TELEOP = ROOT / "examples" / "teleop.py"
 ROBOT = ROOT / "examples" / "teleop.toml"
@@ -37,7 +37,7 @@ class Seen(NamedTuple):
     speed_rad_s: float
 
 
-def said(entries: Iterable[Entry], device_id: int, since: float = 0.0) -> list[Seen]:
+def said(entries: Iterable[LogEntry], device_id: int, since: float = 0.0) -> list[Seen]:
     """All that a joint of the follower reported, which is the truth in a simulator: registers 56 to 61."""
     return [
         Seen(entry.t, (int.from_bytes(entry.data[5:7], "little") - CENTRE) * RAD, signed(entry.data[7:9]) * RAD)
@@ -54,7 +54,7 @@ def signed(data: bytes) -> int:
     return -(number & 0x7FFF) if number & 0x8000 else number
 
 
-def goal_speeds(entries: Iterable[Entry], since: float = 0.0) -> list[float]:
+def goal_speeds(entries: Iterable[LogEntry], since: float = 0.0) -> list[float]:
     """In rad/s, of all goals that were written to the follower: the last of acceleration, goal, time and speed."""
     goals = [entry for entry in motion_writes(entries, since=since, bus="follower") if entry.address == 41]
     return [int.from_bytes(entry.data[5:7], "little") * RAD for entry in goals]

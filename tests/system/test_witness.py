@@ -10,14 +10,14 @@ import pytest
 
 from tests.system.conftest import DORA, ROOT, Program
 from trade import Container, where
-from trade_hil_sim import Entry, SimControl, events, read_log
+from trade_hil_sim import LogEntry, SimControl, events, read_log
 
 EXAMPLES = ROOT / "examples"
 SHOULDER = "dora.right.shoulder"
 pytestmark = [pytest.mark.timeout(240)]
 
 
-def pictures_asked(log: Path, since: float) -> list[Entry]:
+def pictures_asked(log: Path, since: float) -> list[LogEntry]:
     return [entry for entry in events(read_log(log), "received", since=since) if entry.bus == "eye"]
 
 

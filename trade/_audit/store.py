@@ -35,7 +35,7 @@ Make = Callable[[Head], Sequence[AuditRow]]
 """Makes the rows to add after a given end."""
 
 
-class Keep(NamedTuple):
+class Retention(NamedTuple):
     """The limits for keeping rows of a record."""
 
     days: int
@@ -96,7 +96,7 @@ class AuditStore:
         self._file.execute("UPDATE head SET seq = ?, hash = ?", (head.seq, head.hash))
         return head
 
-    def drop(self, keep: Keep, row: AuditRow) -> int:
+    def drop(self, keep: Retention, row: AuditRow) -> int:
         """Drop the oldest rows that need not be kept, and add a row about it. Raises as the class says.
 
         Args:
@@ -123,7 +123,7 @@ class AuditStore:
             self._append(head, [gap])
             return pieces * keep.piece
 
-    def _older(self, oldest: int, before_ns: int, keep: Keep, head: Head) -> int:
+    def _older(self, oldest: int, before_ns: int, keep: Retention, head: Head) -> int:
         """The number of consecutive oldest rows that are older than a moment and may be dropped."""
         most = min(10 * keep.piece, head.seq - oldest + 1 - keep.least)
         if most <= 0:

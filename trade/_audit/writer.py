@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow, Head
-from trade._audit.store import SUFFIX, AuditStore, Keep, move_aside
+from trade._audit.store import SUFFIX, AuditStore, Retention, move_aside
 from trade._settings import Settings
 from trade.protocol.keys import Address, ServiceKey
 
@@ -57,7 +57,7 @@ class AuditWriter:
         path: Path,
         boot: str,
         about: str,
-        keep: Keep,
+        keep: Retention,
         clocks: Callable[[], tuple[int, int]] = lambda: (time.time_ns(), time.monotonic_ns()),
     ) -> None:
         self._path = path
@@ -291,5 +291,5 @@ def start_writing(settings: Settings, folder: Path, own: Address) -> AuditWriter
         "version": importlib.metadata.version("trade-core"),
         "policy": str(settings.policy or ""),
     }
-    keep = Keep(settings.audit_keep_days, settings.audit_keep_rows)
+    keep = Retention(settings.audit_keep_days, settings.audit_keep_rows)
     return AuditWriter(folder / f"{own.container}{SUFFIX}", own.epoch, json.dumps(about), keep)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from trade._calls.handle import Bound, Handle
+from trade._calls.handle import BoundCall, Handle
 from trade._calls.run import Run
 
 _MOST_AT_ONCE: Final = 256
@@ -31,7 +31,7 @@ class Outcome:
         return self.result
 
 
-def begun(call: Bound) -> Run:
+def begun(call: BoundCall) -> Run:
     """Starts a call; an error that prevents its start is its outcome, too."""
     try:
         return call.start()
@@ -41,22 +41,22 @@ def begun(call: Bound) -> Run:
         return run
 
 
-def _ended(call: Bound, run: Run) -> Outcome:
+def _ended(call: BoundCall, run: Run) -> Outcome:
     error = run.exception()
     return Outcome(call.handle, error=error) if error is not None else Outcome(call.handle, run.result())
 
 
-def bound(calls: Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[Bound]:
+def bound(calls: Iterable[Handle | BoundCall], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[BoundCall]:
     """Binds the arguments to handles; bound calls stay as they are."""
-    return [call if isinstance(call, Bound) else call.bind(*args, **kwargs) for call in calls]
+    return [call if isinstance(call, BoundCall) else call.bind(*args, **kwargs) for call in calls]
 
 
-def all_outcomes(calls: Iterable[Bound]) -> list[Outcome]:
+def all_outcomes(calls: Iterable[BoundCall]) -> list[Outcome]:
     """Runs calls concurrently and waits for all; returns their outcomes in order."""
     return list(_waves(list(calls)))
 
 
-def _waves(calls: list[Bound]) -> Iterator[Outcome]:
+def _waves(calls: list[BoundCall]) -> Iterator[Outcome]:
     """Runs a limited number at once, because a local call occupies a thread while it runs."""
     running = [begun(call) for call in calls[:_MOST_AT_ONCE]]
     for index, call in enumerate(calls):
@@ -65,24 +65,24 @@ def _waves(calls: list[Bound]) -> Iterator[Outcome]:
             running.append(begun(calls[len(running)]))
 
 
-async def all_outcomes_async(calls: Iterable[Bound]) -> list[Outcome]:
+async def all_outcomes_async(calls: Iterable[BoundCall]) -> list[Outcome]:
     """The same from asyncio."""
     limit = asyncio.Semaphore(_MOST_AT_ONCE)
 
-    async def one(call: Bound) -> Outcome:
+    async def one(call: BoundCall) -> Outcome:
         async with limit:
             return await _ended_async(call)
 
     return await asyncio.gather(*map(one, calls))
 
 
-async def _ended_async(call: Bound) -> Outcome:
+async def _ended_async(call: BoundCall) -> Outcome:
     run = begun(call)
     await run.settled()
     return _ended(call, run)
 
 
-def sequence(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
+def sequence(calls: Iterable[BoundCall], *, go_on: bool) -> list[Outcome]:
     """Runs calls in sequence; returns the outcomes of those that ran."""
     outcomes: list[Outcome] = []
     for call in calls:
@@ -92,7 +92,7 @@ def sequence(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
     return outcomes
 
 
-async def sequence_async(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
+async def sequence_async(calls: Iterable[BoundCall], *, go_on: bool) -> list[Outcome]:
     """The same from asyncio."""
     outcomes: list[Outcome] = []
     for call in calls:

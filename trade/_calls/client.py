@@ -8,7 +8,7 @@ from typing import Any, Final, cast
 from trade._calls import batch
 from trade._calls.everywhere import Everywhere, answers, everywhere
 from trade._calls.group_view import GroupView, Members
-from trade._calls.handle import Bound, Handle, service_of
+from trade._calls.handle import BoundCall, Handle, service_of
 from trade._calls.picking import Pick, Picker, narrowed, required
 from trade._calls.reachability import Reachability, beyond, look_around
 from trade._calls.run import Run
@@ -350,7 +350,7 @@ class CallClient:
         return list(map(self.handle_of, matches))
 
     def call_all(
-        self, which: Constraint | str | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+        self, which: Constraint | str | Iterable[Handle | BoundCall], /, *args: Any, **kwargs: Any
     ) -> list[batch.Outcome]:
         """Calls several services at once and waits for all of them.
 
@@ -364,7 +364,7 @@ class CallClient:
         """
         return batch.all_outcomes(self._bound(which, args, kwargs))
 
-    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[batch.Outcome]:
+    def call_sequence(self, calls: Iterable[Handle | BoundCall], /, *, go_on: bool = False) -> list[batch.Outcome]:
         """Makes calls one after the other.
 
         Args:
@@ -397,12 +397,14 @@ class CallClient:
         return await handle.acall(*args, **kwargs)
 
     async def acall_all(
-        self, which: Constraint | str | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+        self, which: Constraint | str | Iterable[Handle | BoundCall], /, *args: Any, **kwargs: Any
     ) -> list[batch.Outcome]:
         """`call_all` from asyncio."""
         return await batch.all_outcomes_async(self._bound(which, args, kwargs))
 
-    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[batch.Outcome]:
+    async def acall_sequence(
+        self, calls: Iterable[Handle | BoundCall], /, *, go_on: bool = False
+    ) -> list[batch.Outcome]:
         """`call_sequence` from asyncio."""
         return await batch.sequence_async(self._bound(calls, (), {}), go_on=go_on)
 
@@ -421,8 +423,8 @@ class CallClient:
         return everywhere(self, self.registry, name, container)
 
     def _bound(
-        self, which: Constraint | str | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> list[Bound]:
+        self, which: Constraint | str | Iterable[Handle | BoundCall], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> list[BoundCall]:
         self.check_open()
         return batch.bound(self.services(which) if isinstance(which, Constraint | str) else which, args, kwargs)
 

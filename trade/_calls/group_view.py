@@ -37,19 +37,19 @@ class Members:
         self.handle = handle
         self._wait_s = wait_s
         self.follow = follow
-        self._kept: dict[ServiceKey, tuple[weakref.ref[GroupView], str]] = {}
+        self._views: dict[ServiceKey, tuple[weakref.ref[GroupView], str]] = {}
         """The attributes that are forgotten when their service leaves."""
 
     def keep(self, handle: Handle, of: "GroupView", name: str) -> None:
         """Forget an attribute of a group once its service has left."""
-        self._kept[handle.key] = (weakref.ref(of), name)
+        self._views[handle.key] = (weakref.ref(of), name)
         if not handle.alive:  # it has left meanwhile
             self.forget([handle.key])
 
     def forget(self, left: Iterable[ServiceKey]) -> None:
         """These services have left."""
         for key in left:
-            view, name = self._kept.pop(key, (None, ""))
+            view, name = self._views.pop(key, (None, ""))
             of = None if view is None else view()
             if of is not None:
                 vars(of).pop(name, None)

@@ -127,9 +127,9 @@ class Handle(Generic[_Arguments, _Result]):
             raise ConfigurationError(problem=problem)
         return Handle(self._home, self.key, self._record, deadline_s)
 
-    def bind(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> "Bound":
+    def bind(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> "BoundCall":
         """The call as a value, to be made later; its arguments are checked then."""
-        return Bound(self, args, kwargs)
+        return BoundCall(self, args, kwargs)
 
     # --- its description
 
@@ -291,7 +291,7 @@ def _parameter(described: Parameter, schema: Mapping[str, Any]) -> inspect.Param
     return inspect.Parameter(described.name, kind, default=default, annotation=schema_name(schema))
 
 
-class Bound:
+class BoundCall:
     """A bound call: a handle with arguments. Call it, compare it, put it into a sequence."""
 
     __slots__ = ("args", "handle", "kwargs")
@@ -317,7 +317,7 @@ class Bound:
         return await self.start()
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Bound) and (self.handle, self.args, self.kwargs) == (
+        return isinstance(other, BoundCall) and (self.handle, self.args, self.kwargs) == (
             other.handle,
             other.args,
             other.kwargs,

@@ -148,7 +148,7 @@ class CallPublishers:
         self._transport = transport
         self._identity = identity
         self._lock = threading.Lock()
-        self._made: dict[str, Publisher] = {}
+        self._publishers: dict[str, Publisher] = {}
         """The publishers, by key."""
         self._urgent: set[Publisher] = set()
         """The publishers of stops."""
@@ -156,9 +156,9 @@ class CallPublishers:
     def get(self, key: str, *, stop: bool) -> Publisher:
         """The publisher of a provider's key. Raises ChannelClosed if the transport is closed."""
         with self._lock:
-            found = self._made.get(key)
+            found = self._publishers.get(key)
             if found is None:
-                found = self._made[key] = self._transport.publish(key, urgent=stop)
+                found = self._publishers[key] = self._transport.publish(key, urgent=stop)
                 if stop:
                     self._urgent.add(found)
             return found
@@ -171,7 +171,7 @@ class CallPublishers:
         """Closes the publishers of a provider that is gone."""
         keys = [call_key(self._identity, callee, domain, provider, stop=stop) for stop in (False, True)]
         with self._lock:
-            gone = [self._made.pop(key, None) for key in keys]
+            gone = [self._publishers.pop(key, None) for key in keys]
             self._urgent.difference_update(gone)
         for publisher in gone:
             if publisher is not None:
@@ -179,5 +179,5 @@ class CallPublishers:
 
     def close(self) -> None:
         """Closes all publishers."""
-        for publisher in list(self._made.values()):
+        for publisher in list(self._publishers.values()):
             publisher.close()

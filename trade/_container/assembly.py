@@ -129,16 +129,16 @@ class Components:
 
     def _build_transport(self, leaving: contextlib.ExitStack, transport: Transport | None) -> None:
         self.audit = open_audit(self.settings, self._address, leaving)
-        self._given = transport is not None
+        self._transport_is_given = transport is not None
         """Whether the transport was given: then it carries everything."""
         self.events = EventLog(self._address.container)
-        self._certificate = None if self._given else self.settings.certificate()
+        self._certificate = None if self._transport_is_given else self.settings.certificate()
         self.transport = transport or join(self.settings, self._certificate, leaving)
         leaving.callback(self.transport.close)
         self._timers = Scheduler("trade-timers", self.transport.clock)
         """Has a fixed number of tasks, fewer than it may have threads. So none waits for another one that blocks."""
         leaving.callback(self._timers.close)
-        self._real_timers = Scheduler("trade-timers") if self._given else self._timers
+        self._real_timers = Scheduler("trade-timers") if self._transport_is_given else self._timers
         """The same on the computer's clock, where a test may move the other one."""
         leaving.callback(self._real_timers.close)
         if self._certificate is not None:
@@ -146,7 +146,7 @@ class Components:
             ExpiryWatch(self._certificate, self._real_timers, ends)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
-        own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
+        own_pair = not self._transport_is_given and self.settings.tls is None and self.settings.credentials is None
         self._secret = user_secret()[1] if own_pair else ""
         """The secret of this user on this host, if the container's links use it."""
         self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
@@ -175,7 +175,7 @@ class Components:
     def _local_path(self) -> LocalPath | None:
         """The local path to others; None if it is switched off, or the transport was given."""
         settings = self.settings
-        if not settings.local_path or self._given:
+        if not settings.local_path or self._transport_is_given:
             return None
         password = "" if settings.tls is not None else "\n".join(settings.credentials or user_secret())
         return LocalPath(settings.system, Passport(self._address, settings.certificate, password))

@@ -30,10 +30,10 @@ def begin_watching(access: Authorizer, scheduler: Scheduler, audit: _Audit, rech
         audit: records the changes.
         recheck_access: applies a changed policy.
     """
-    _Watching(access, scheduler, audit, recheck_access)
+    _PolicyWatch(access, scheduler, audit, recheck_access)
 
 
-class _Watching:
+class _PolicyWatch:
     def __init__(
         self, access: Authorizer, scheduler: Scheduler, audit: _Audit, recheck_access: Callable[[], None]
     ) -> None:

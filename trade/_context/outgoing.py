@@ -42,7 +42,7 @@ class Claim(Struct, frozen=True):
         return self.constraint is not None and self.constraint.matches(record)
 
 
-class Held(Protocol):
+class UsableLock(Protocol):
     """A lock that the running code holds or uses: a `Lock`, or an `InheritedLock`."""
 
     @property
@@ -69,10 +69,10 @@ class Held(Protocol):
         ...
 
 
-holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
+holding: ContextVar[tuple[UsableLock, ...]] = ContextVar("trade_locks", default=())
 """The locks around the running code, outermost first."""
 
-handed_down: Final[dict[Address, Held]] = {}
+handed_down: Final[dict[Address, UsableLock]] = {}
 """Locks that other processes passed on to this one, by the container whose calls carry them."""
 
 
@@ -81,7 +81,7 @@ class Inherited(Struct, gc=False):
 
     outer: CallContext | None
     """The call that makes it."""
-    around: tuple[Held, ...]
+    around: tuple[UsableLock, ...]
     """The locks around it."""
     client: Session | None
     """The client that it is made for; None: the container itself."""
@@ -179,7 +179,7 @@ def in_ns(deadline_s: float | None) -> int:
     return _DEFAULT_DEADLINE_NS if deadline_s is None else int(deadline_s * 1e9)
 
 
-def _require_held(locks: Sequence[Held], record: Record) -> None:
+def _require_held(locks: Sequence[UsableLock], record: Record) -> None:
     """Raises NotLocked if the locks around a command select its service but none of them holds it."""
     if any(lock.claim.covers(record) for lock in locks):
         return

@@ -27,7 +27,7 @@ class Announcer:
         self._lock = threading.Lock()
         self._current: dict[str, bytes] = {}
         self._revision = 0
-        self._shown = False
+        self._is_announced = False
         self._quiet = 0
         """Beats since the last announcement."""
         self._questions = transport.questions(registry_key("*", own, "*"))
@@ -40,7 +40,7 @@ class Announcer:
         Raises:
             ChannelClosed: the transport was closed.
         """
-        self._shown = True
+        self._is_announced = True
         return self._transport.appear(alive_key(self._own))
 
     def announce(self, domain: str, provider: str, info: ProviderInfo) -> None:
@@ -56,7 +56,7 @@ class Announcer:
                 self._current[key] = payload
             else:
                 self._current.pop(key, None)
-        if self._shown:
+        if self._is_announced:
             self._transport.announce(key, payload)
 
     def beat(self) -> None:

@@ -61,7 +61,7 @@ class NetworkInfo(Struct, frozen=True, kw_only=True):
     """Whether it listens on all interfaces, and their addresses are no longer those of its start."""
 
 
-class _Seen(Struct):
+class _LinkRecord(Struct):
     """A link that exists, and what was said about it."""
 
     since_ns: int
@@ -84,7 +84,7 @@ class LinkTable:
         self._answers = answers
         self._tell = callback
         self._looking = threading.Lock()
-        self._seen: dict[Link, _Seen] = {}
+        self._records: dict[Link, _LinkRecord] = {}
 
     def infos(self) -> list[LinkInfo]:
         """The links at this moment; also reports those to containers that came or went since the last time."""
@@ -95,7 +95,7 @@ class LinkTable:
             if current is None:
                 return []
             came, went = self._compare(current)
-            seen = dict(self._seen)
+            seen = dict(self._records)
         for link, one in went:
             self._report("unlinked", link, one)
         for link, one in came:
@@ -103,23 +103,23 @@ class LinkTable:
         now_ns = time.monotonic_ns()
         return [self._info(link, one, now_ns) for link, one in seen.items()]
 
-    def _compare(self, current: list[Link]) -> tuple[list[tuple[Link, _Seen]], list[tuple[Link, _Seen]]]:
+    def _compare(self, current: list[Link]) -> tuple[list[tuple[Link, _LinkRecord]], list[tuple[Link, _LinkRecord]]]:
         """The links to known containers that came, and those that went. Requires the lock."""
         there = set(current)
         known = {state.transport: state.address for state in self._registry.containers() if state.transport}
-        went = [(link, one) for link, one in self._seen.items() if link not in there and one.to is not None]
-        self._seen = {link: self._seen.get(link) or _Seen(time.monotonic_ns()) for link in current}
-        came: list[tuple[Link, _Seen]] = []
-        for link, one in self._seen.items():
+        went = [(link, one) for link, one in self._records.items() if link not in there and one.to is not None]
+        self._records = {link: self._records.get(link) or _LinkRecord(time.monotonic_ns()) for link in current}
+        came: list[tuple[Link, _LinkRecord]] = []
+        for link, one in self._records.items():
             if one.to is None and (to := known.get(link.session)) is not None:
                 one.to, one.clock = to, clock_of(self._registry, to)
                 came.append((link, one))
         return came, went
 
-    def _report(self, kind: Literal["linked", "unlinked"], link: Link, one: _Seen) -> None:
+    def _report(self, kind: Literal["linked", "unlinked"], link: Link, one: _LinkRecord) -> None:
         self._tell(kind, "" if one.to is None else one.to.container, link.there, one.clock)
 
-    def _info(self, link: Link, one: _Seen, now_ns: int) -> LinkInfo:
+    def _info(self, link: Link, one: _LinkRecord, now_ns: int) -> LinkInfo:
         return LinkInfo(
             to="" if one.to is None else one.to.container,
             identity="" if one.to is None else one.to.identity,

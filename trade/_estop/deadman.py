@@ -130,7 +130,7 @@ class _StopGroup:
     ) -> None:
         self._stops = stops
         self._on_stopped = on_stopped
-        self._left = set(stops)
+        self._unfinished = set(stops)
         self._problems: list[str] = []
         self._guard = threading.Lock()
         if not stops:
@@ -142,12 +142,12 @@ class _StopGroup:
     def _service_stopped(self, service: LocalService, problem: str) -> None:
         """Takes the first result of each service; later ones do not count."""
         with self._guard:
-            if service not in self._left:
+            if service not in self._unfinished:
                 return
-            self._left.remove(service)
+            self._unfinished.remove(service)
             if problem:
                 self._problems.append(problem)
-            last = not self._left
+            last = not self._unfinished
         for resource in self._stops[service] if problem else ():
             resource.stop_ended(problem)
         if last:

@@ -60,7 +60,7 @@ class Pending(Struct, gc=False):
     noted: bool = False
     """Whether it is on disk."""
     problem: str = ""
-    relayed: "Sequence[Relayed]" = ()
+    relayed: "Sequence[PendingEstop]" = ()
     """Where it is passed on to, such as another system."""
 
     def result(self) -> str | None:
@@ -72,7 +72,7 @@ class Pending(Struct, gc=False):
         return "; ".join(filter(None, [*failed, *passed_on, self.problem]))
 
 
-class Relayed:
+class PendingEstop:
     """An e-stop that is passed on, until the subscriber has answered."""
 
     def __init__(self, estop: Estop) -> None:
@@ -147,12 +147,12 @@ class Relay:
         self.callback: Final = callback
         self._is_open = is_open
         self._guard = threading.Lock()
-        self._waiting: dict[str, Relayed] = {}
+        self._waiting: dict[str, PendingEstop] = {}
         self._worker = Worker(self._next, "trade-estop-relay")
 
-    def give(self, estop: Estop) -> Relayed:
+    def give(self, estop: Estop) -> PendingEstop:
         """Adds an e-stop; does not wait."""
-        added = Relayed(estop)
+        added = PendingEstop(estop)
         with self._guard:
             self._waiting = {name: one for name, one in self._waiting.items() if self._is_open(name)}
             self._waiting[estop.id] = added

@@ -25,7 +25,7 @@ _PATIENCE_S = 1.0
 """How long a call that arrives before its caller's liveliness token waits for it."""
 
 
-class Exposed(NamedTuple):
+class ProviderPlace(NamedTuple):
     """The place of a provider."""
 
     address: Address
@@ -40,7 +40,7 @@ class Exposed(NamedTuple):
 class MemberSystem(NamedTuple):
     """Access to a provider in its home system."""
 
-    place: Exposed
+    place: ProviderPlace
     handle: Callable[[ServiceKey], Handle]
     speaking: Speaking
     codec: Codec
@@ -82,10 +82,10 @@ class Federation:
 
     # --- showing
 
-    def offers(self) -> dict[Exposed, ProviderInfo]:
+    def offers(self) -> dict[ProviderPlace, ProviderInfo]:
         """All providers of the system that the policy allows, without the middleware's own."""
         return {
-            Exposed(state.address, entry.domain, name): entry.info
+            ProviderPlace(state.address, entry.domain, name): entry.info
             for state in self._registry.containers()
             for name, entry in list(state.providers.items())
             if entry.records and entry.domain != DOMAIN
@@ -102,7 +102,7 @@ class Federation:
 
     # --- offering
 
-    def pass_on(self, provider: object, info: ProviderInfo, home: MemberSystem) -> Exposed:
+    def pass_on(self, provider: object, info: ProviderInfo, home: MemberSystem) -> ProviderPlace:
         """Offers a provider of another system.
 
         Args:
@@ -124,7 +124,7 @@ class Federation:
                     self._locks.drop(one)
                 raise ConfigurationError(where=place, problem=str(twice)) from None
 
-        return Exposed(self._address, *self._providers.pass_on(provider, info, make))
+        return ProviderPlace(self._address, *self._providers.pass_on(provider, info, make))
 
     def _passed_on(
         self, place: str, service: ServiceInfo, info: ProviderInfo, home: MemberSystem, adopted: list[Resource]
@@ -145,7 +145,7 @@ class Federation:
         self._providers.remove(provider)
 
 
-def _lockable(place: str, service: ServiceInfo, home: Exposed) -> dict[str, str]:
+def _lockable(place: str, service: ServiceInfo, home: ProviderPlace) -> dict[str, str]:
     """The resources that locks of a service hold, by the names here and at home; a stop has none."""
     if service.effect == "stop":
         return {}

@@ -6,7 +6,7 @@ import logging
 from typing import Any, Final
 
 from trade._calls.client import CallClient
-from trade._calls.handle import Bound, Handle
+from trade._calls.handle import BoundCall, Handle
 from trade._calls.run import Run
 from trade._hooks.callee import Callee, callee_of
 from trade._hooks.hook import HookInfo, Side, require_limit
@@ -152,7 +152,9 @@ class HookApi:
         named = f"trade.{side}_service"
         target = given if isinstance(given, Handle) else as_constraint(given, named, services_at)
         if not isinstance(call, Handle | Constraint | str):  # pyright: ignore[reportUnnecessaryIsInstance]
-            rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
+            rest = (
+                "without arguments of its own" if isinstance(call, BoundCall) else "as it runs where the service does"
+            )
             problem = f"call must be a handle, where(...) or a text such as 'eye.see', {rest}, not {call!r}"
             raise ConfigurationError(where=named, problem=problem)
         callee = callee_of(call, named)

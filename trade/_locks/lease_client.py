@@ -11,7 +11,7 @@ from typing import Any, Final, NoReturn
 from msgspec import structs
 
 from trade._calls.client import CallClient
-from trade._calls.handle import Bound, Handle
+from trade._calls.handle import BoundCall, Handle
 from trade._calls.run import Run
 from trade._locks.lock import Lock, in_own_thread
 from trade._resources.grants import LockRequest
@@ -98,7 +98,7 @@ class LeaseClient:
                         raise
                     time.sleep(_AGAIN_S)
 
-    def _ask(self, address: Address, names: Sequence[str], terms: LockRequest) -> Bound:
+    def _ask(self, address: Address, names: Sequence[str], terms: LockRequest) -> BoundCall:
         ask = self._service(address, "acquire").with_(deadline_s=terms.wait_s + _ANSWER_S)
         return ask.bind(list(names), terms)
 
@@ -216,7 +216,7 @@ def _renewal_ns(now: float, locks: Sequence[Lock]) -> float:
     return (now + min((lock.lease_s for lock in locks), default=math.inf) / _BEATS) * 1e9
 
 
-def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Callable[[], Any]]]:
+def _at_once(calls: Sequence[tuple[Address, BoundCall]]) -> list[tuple[Address, Callable[[], Any]]]:
     """Makes calls concurrently; returns a getter for each result. The first call runs on this same thread."""
     if not calls:
         return []
@@ -224,7 +224,7 @@ def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Call
     return [(first, call), *((address, _started(other)) for address, other in others)]
 
 
-def _started(call: Bound) -> Callable[[], Any]:
+def _started(call: BoundCall) -> Callable[[], Any]:
     try:
         return call.start().result
     except TradeError as error:  # the service is gone; the other calls are made all the same

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from msgspec import structs
 
 from trade._context.call_context import patience_s
-from trade._context.outgoing import Claim, Held, holding
+from trade._context.outgoing import Claim, UsableLock, holding
 from trade._locks.inherited import VARIABLE, passed_on
 from trade._resources.grants import Granted, LockRequest
 from trade.errors import ConfigurationError, LockLost, TradeError
@@ -102,9 +102,9 @@ class Lock:
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None
         """Why it is lost; never raised itself, as it would keep every frame that it passed through."""
-        self._taken = self._whole = self._ended = False
+        self._is_acquired = self._whole = self._ended = False
         self._guard = threading.Lock()
-        self._resets: list[Reset[tuple[Held, ...]]] = []
+        self._resets: list[Reset[tuple[UsableLock, ...]]] = []
 
     # --- being used
 
@@ -119,10 +119,10 @@ class Lock:
             LockLost: a part was lost while it waited for the rest.
         """
         with self._guard:
-            if self._taken:
+            if self._is_acquired:
                 problem = "a lock is taken once; create another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
-            self._taken = True
+            self._is_acquired = True
         until = self._lease_client.clock.now() + patience_s(self._terms.wait_s)
         wanted, self.missing = self._wanted()
         left_s = max(0.0, until - self._lease_client.clock.now())

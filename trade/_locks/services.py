@@ -143,9 +143,9 @@ class LockServices:
         return [holder.owner for holder in holders.values()] + self._remote_locks.request_release(call, free, reason)
 
     @service
-    def release_requested(self, token: Token, who: str, reason: str) -> bool:
+    def release_requested(self, token: Token, requester: str, reason: str) -> bool:
         """Takes a release request for a lock of this container; returns whether its owner handles requests."""
-        return self._on_release_requested(token, who, reason)
+        return self._on_release_requested(token, requester, reason)
 
     @service
     def resume(self, resources: list[str]) -> list[str]:

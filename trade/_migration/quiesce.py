@@ -19,7 +19,7 @@ LONGEST_S: Final = 60.0
 """The longest time that a provider is held still."""
 
 
-class Frozen:
+class BlockedResources:
     """The resources of one provider, blocked for every client."""
 
     def __init__(self, table: LockTable, number: int, resources: tuple[Resource, ...]) -> None:
@@ -71,7 +71,7 @@ class Quiescer:
     @contextlib.contextmanager
     def frozen(
         self, services: Mapping[str, LocalService], alone: Callable[[], list[Resource]], purpose: str
-    ) -> Generator[Frozen, None, None]:
+    ) -> Generator[BlockedResources, None, None]:
         """Hold a provider still once its running calls have ended.
 
         Args:
@@ -101,7 +101,7 @@ class Quiescer:
         granted = self._table.acquire([resource.name for resource in moved], holder, terms)
         number = 0 if granted.token is None else granted.token.number
         try:
-            yield Frozen(self._table, number, resources)
+            yield BlockedResources(self._table, number, resources)
         finally:
             self._table.release(number, own.identity)
 

@@ -14,12 +14,12 @@ from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import running
 from trade._migration.factory import Arguments, ProviderFactory, path_of
-from trade._migration.quiesce import Frozen, Quiescer, is_stateful, restore, save
+from trade._migration.quiesce import BlockedResources, Quiescer, is_stateful, restore, save
 from trade._migration.target import Prepared, ProviderSnapshot, fingerprint
 from trade._registry.constraints import where
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
-from trade._services.registration import Offer
+from trade._services.registration import ProviderOffer
 from trade._services.withdrawn import WithdrawnProviders
 from trade._telemetry.load import busyness
 from trade.errors import (
@@ -82,14 +82,14 @@ class MigrationSource:
             restore(offer.provider, state)
             frozen.check()
 
-    def _stateful(self, service: Handle, caller: str) -> Offer:
+    def _stateful(self, service: Handle, caller: str) -> ProviderOffer:
         offer = self._offer(service, caller)
         if not is_stateful(type(offer.provider)):
             problem = "it has no state to save and restore; its class needs save_state() and restore_state(state)"
             raise ConfigurationError(where=service.label, problem=problem)
         return offer
 
-    def _offer(self, service: Handle, caller: str) -> Offer:
+    def _offer(self, service: Handle, caller: str) -> ProviderOffer:
         """The registration of a service's provider; raises ServiceGone, AccessDenied, ConfigurationError."""
         key = service.key
         if key.address != self._client.address:
@@ -104,12 +104,12 @@ class MigrationSource:
         self._require(caller, key, offer)
         return offer
 
-    def _require(self, caller: str, key: ServiceKey, offer: Offer) -> None:
+    def _require(self, caller: str, key: ServiceKey, offer: ProviderOffer) -> None:
         for group in dict.fromkeys((key.domain, *offer.groups)):
             self._access.require(caller, "administer", group, f"{type(offer.provider).__qualname__} in {group}")
 
     @contextlib.contextmanager
-    def _freeze(self, service: Handle, offer: Offer, purpose: str) -> Generator[Frozen, None, None]:
+    def _freeze(self, service: Handle, offer: ProviderOffer, purpose: str) -> Generator[BlockedResources, None, None]:
         place = _place(service.key)
         with self._lock:
             if place in self._frozen_places:
@@ -154,7 +154,7 @@ class MigrationSource:
                 running.reset(free)
         return [self._client.handle(key) for key in keys]
 
-    def _require_free(self, service: Handle, offer: Offer) -> None:
+    def _require_free(self, service: Handle, offer: ProviderOffer) -> None:
         """S20: hardware is bound to its host, unless its driver declares that other hosts can reach it."""
         uses = {name for one in self._providers.services_at(_place(service.key)).values() for name in one.info.uses}
         if uses and not getattr(offer.provider, "relocatable", False):
@@ -176,7 +176,7 @@ class MigrationSource:
             _logger.info("container %s does not report its load: %s", there.container, error)
             return float("inf"), 0.0
 
-    def _packed(self, service: Handle, offer: Offer, there: Handle, args: Arguments | None) -> ProviderSnapshot:
+    def _packed(self, service: Handle, offer: ProviderOffer, there: Handle, args: Arguments | None) -> ProviderSnapshot:
         kind, stateful = type(offer.provider), is_stateful(type(offer.provider))
         try:
             state = save(offer.provider) if stateful else None
@@ -195,7 +195,7 @@ class MigrationSource:
             state=state,
         )
 
-    def _hand_over(self, service: Handle, offer: Offer, keys: list[ServiceKey], ticket: str, name: str) -> None:
+    def _hand_over(self, service: Handle, offer: ProviderOffer, keys: list[ServiceKey], ticket: str, name: str) -> None:
         """Offer the withdrawn provider there, or here again if it is certain that the target will not."""
         there, problem = keys[0].address, ""
         try:

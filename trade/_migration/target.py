@@ -15,7 +15,7 @@ from trade._migration.quiesce import Quiescer, is_stateful, restore
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import marked_methods
 from trade._services.providers import Providers
-from trade._services.registration import Built, checked_groups
+from trade._services.registration import BuiltProvider, checked_groups
 from trade._services.signature import Signature
 from trade._threads.scheduler import ScheduledTask, Scheduler
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
@@ -59,7 +59,7 @@ class _PreparedProvider(Struct, eq=False):
     caller: str
     provider: object
     snapshot: ProviderSnapshot
-    built: Built
+    built: BuiltProvider
     provider_cleanup: contextlib.ExitStack
     """Closes the provider; emptied once it is offered."""
     cleanup: contextlib.ExitStack
@@ -138,7 +138,9 @@ class MigrationTarget:
         for group in snapshot.groups or (domain_of(snapshot.groups),):
             self._access.require(caller, "register", group, f"{snapshot.class_path} in {group}")
 
-    def _create(self, snapshot: ProviderSnapshot, provider_cleanup: contextlib.ExitStack) -> tuple[object, Built]:
+    def _create(
+        self, snapshot: ProviderSnapshot, provider_cleanup: contextlib.ExitStack
+    ) -> tuple[object, BuiltProvider]:
         provider_class = self._factory.find(snapshot.class_path)
         implements = [self._interface(path) for path in snapshot.implements]
         if fingerprint(provider_class, implements, self._codec) != snapshot.fingerprint:
@@ -158,7 +160,9 @@ class MigrationTarget:
             raise NoSuchClass(class_path=path, container=here, reason="nothing there has imported this interface")
         return found
 
-    def _restore(self, snapshot: ProviderSnapshot, provider: object, built: Built, undo: contextlib.ExitStack) -> None:
+    def _restore(
+        self, snapshot: ProviderSnapshot, provider: object, built: BuiltProvider, undo: contextlib.ExitStack
+    ) -> None:
         """Restore under a lock, so that the permit refuses every command that the provider gives meanwhile (S18)."""
         used = {resource for service in built.services.values() for resource in service.resources}
         purpose = f"{snapshot.class_path} arriving"

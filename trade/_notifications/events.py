@@ -53,7 +53,7 @@ class EventLog:
     def __init__(self, container: str) -> None:
         self._container = container
         self._lock = threading.Lock()
-        self._kept: deque[StateEvent] = deque(maxlen=_MOST)
+        self._events: deque[StateEvent] = deque(maxlen=_MOST)
         self._noted = 0
         self.occurred: Final = Event[tuple[StateEvent, Record | None]]()
         """Emitted with each event, and the service that it is about, if any."""
@@ -65,10 +65,10 @@ class EventLog:
             event = StateEvent(
                 number=self._noted, at=time.time(), kind=kind, container=self._container, about=about, text=text
             )
-            self._kept.append(event)
+            self._events.append(event)
         self.occurred.emit((event, record))
 
     def after(self, number: int) -> list[StateEvent]:
         """The events after a number, oldest first."""
         with self._lock:
-            return [event for event in self._kept if event.number > number]
+            return [event for event in self._events if event.number > number]

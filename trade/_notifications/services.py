@@ -20,7 +20,7 @@ from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 _logger = logging.getLogger("trade")
 
 
-class Guests:
+class OwnerSessions:
     """Sessions for the owners of notifications in this container: what one's calls move stops with its session."""
 
     def __init__(self, open_session: Callable[[str], Session]) -> None:
@@ -49,7 +49,7 @@ class NotificationServices:
     def __init__(self, notifier: Notifier, client: CallClient, open_session: Callable[[str], Session]) -> None:
         self._notifier = notifier
         self._client = client
-        self._guests = Guests(open_session)
+        self._guests = OwnerSessions(open_session)
         notifier.failed = self._notify_owner
         notifier.ended = self._guests.leave
 

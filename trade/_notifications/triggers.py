@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, cast
 
 from msgspec import Struct
 
-from trade._calls.handle import Bound, Handle
+from trade._calls.handle import BoundCall, Handle
 from trade._notifications.events import EVENT_KINDS
 from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade.errors import ConfigurationError
@@ -39,7 +39,7 @@ class Action(Struct, frozen=True):
         return f"the service with {self.constraint}"
 
 
-What = Callable[..., Any] | Handle | Bound | Constraint | str
+What = Callable[..., Any] | Handle | BoundCall | Constraint | str
 """The target of a call: a handle, a bound call, a service by a constraint or as text, or a function of this process."""
 Target = Action | Callable[..., Any]
 
@@ -127,7 +127,7 @@ def target_of(what: What, where: str, argument: str, given: int) -> Target:
     """
     if isinstance(what, Handle):
         return Action(handle=cast("Handle", what))
-    if isinstance(what, Bound):
+    if isinstance(what, BoundCall):
         return Action(handle=what.handle, args=what.args, kwargs=dict(what.kwargs))
     if isinstance(what, Constraint | str):
         return Action(constraint=as_constraint(what, where, service_at))

@@ -60,7 +60,7 @@ class Record(Struct, frozen=True):
         return f"{self.groups[0] if self.groups else self.kind}.{self.info.name}"
 
 
-class Entry(NamedTuple):
+class Announcement(NamedTuple):
     """The announcement of one provider, and the records made from it."""
 
     domain: str
@@ -82,7 +82,7 @@ class ContainerState:
     """The state of one boot of one container while its sign of life is present."""
 
     address: Address
-    providers: dict[str, "Entry"] = field(default_factory=dict)
+    providers: dict[str, "Announcement"] = field(default_factory=dict)
     """By name."""
     removed: dict[str, str] = field(default_factory=dict)
     """Deregistered providers in order, with their new places if they moved: no name is used twice in one boot."""
@@ -284,7 +284,7 @@ class Registry:
             if known is None and len(state.providers) >= _MOST_PROVIDERS:
                 continue
             made = self._make(state.address, domain, provider, info)
-            state.providers[provider] = Entry(domain, info, made)
+            state.providers[provider] = Announcement(domain, info, made)
             before += _records(known)
             after += made
         return self._swap(before, after)
@@ -411,5 +411,5 @@ def _all(state: ContainerState) -> list[Record]:
     return [record for entry in state.providers.values() for record in entry.records]
 
 
-def _records(entry: Entry | None) -> list[Record]:
+def _records(entry: Announcement | None) -> list[Record]:
     return [] if entry is None else entry.records

@@ -18,10 +18,10 @@ from trade.protocol.schema import schema_message, type_text
 from trade.protocol.schema_types import name_of, noted
 
 
-def field_of(parameter: inspect.Parameter, kind: Any) -> Any:
+def field_of(parameter: inspect.Parameter, type_: Any) -> Any:
     if parameter.default is inspect.Parameter.empty:
-        return (parameter.name, kind)
-    return (parameter.name, kind | UnsetType if kind is not Any else Any, UNSET)
+        return (parameter.name, type_)
+    return (parameter.name, type_ | UnsetType if type_ is not Any else Any, UNSET)
 
 
 def described(where: str, what: str, build: Callable[[], Any]) -> Any:
@@ -67,13 +67,13 @@ def describe(
     )
 
 
-def _noted_fields(schema: dict[str, Any], kind: type | None, codec: Codec) -> dict[str, Any]:
+def _noted_fields(schema: dict[str, Any], type_: type | None, codec: Codec) -> dict[str, Any]:
     """The schema of a struct with the field types that JSON Schema cannot express."""
-    fields: Sequence[str] = getattr(kind, "__struct_fields__", ())
+    fields: Sequence[str] = getattr(type_, "__struct_fields__", ())
     if not fields or "properties" not in schema:
         return schema
-    sent = dict(zip(fields, kind.__struct_encode_fields__, strict=True))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-    hints = get_type_hints(kind, include_extras=True)
+    sent = dict(zip(fields, type_.__struct_encode_fields__, strict=True))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    hints = get_type_hints(type_, include_extras=True)
     properties = {
         sent[name]: {**schema["properties"][sent[name]], **codec.schema(noted(hints[name]))[0]}
         for name in fields
@@ -115,20 +115,20 @@ def _default_text(parameter: inspect.Parameter, hint: str) -> str:
     return f" = {parameter.default!r}" if hint else f"={parameter.default!r}"
 
 
-def _types_in(kind: Any, seen: set[int]) -> list[type]:
+def _types_in(type_: Any, seen: set[int]) -> list[type]:
     """The structs, dataclasses and enums that a type mentions, at any depth."""
-    if id(kind) in seen:
+    if id(type_) in seen:
         return []
-    seen.add(id(kind))
+    seen.add(id(type_))
     found: list[type] = []
-    if isinstance(kind, type) and kind.__module__ != "builtins":
-        found.append(kind)
+    if isinstance(type_, type) and type_.__module__ != "builtins":
+        found.append(type_)
         try:
-            nested = list(get_type_hints(kind, include_extras=True).values())
+            nested = list(get_type_hints(type_, include_extras=True).values())
         except Exception:  # noqa: BLE001 - foreign classes may have any annotations
             nested = []
     else:
-        nested = list(getattr(kind, "__args__", ()))
+        nested = list(getattr(type_, "__args__", ()))
     for inner in nested:
         found += _types_in(inner, seen)
     return found

@@ -92,14 +92,14 @@ class IncomingCall(Struct, frozen=True, gc=False):
     """The ``domain/provider`` that it calls; empty once only the answer remains to be sent."""
 
 
-class _Nowhere(Publisher):
+class _NullPublisher(Publisher):
     """Takes the answers of connections that have ended."""
 
     def put(self, payload: bytes) -> None: ...
     def close(self) -> None: ...
 
 
-_NOWHERE: Final = _Nowhere()
+_NOWHERE: Final = _NullPublisher()
 
 
 class CallPool(Protocol):

@@ -20,7 +20,7 @@ from trade._security.authorizer import Authorizer
 from trade._services.decorator import ServiceMark, check_of, kinds_of, marked_methods
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
-from trade._services.registration import Built, Offer, Registered, require_stop
+from trade._services.registration import BuiltProvider, ProviderOffer, RegisteredProvider, require_stop
 from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError
@@ -59,7 +59,7 @@ class Providers:
         self._announcing = threading.RLock()
         """Serialises announcements: revisions go out in order."""
         self._revision = 0
-        self._hosted: dict[str, Registered] = {}
+        self._hosted: dict[str, RegisteredProvider] = {}
         self._names: dict[int, str] = {}
         self._moved: dict[str, str] = {}
         """By place, where the providers went that moved away last."""
@@ -102,7 +102,7 @@ class Providers:
         *,
         meta: Mapping[str, Scalar] | None = None,
         name: str | None = None,
-    ) -> Built:
+    ) -> BuiltProvider:
         """Do all of `add` that can fail: `host` then offers the result, or `discard` gives its resources back."""
         kind, domain = type(provider).__qualname__, domain_of(groups)
         if domain != DOMAIN:
@@ -123,13 +123,13 @@ class Providers:
             estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
         )
         keys = tuple(ServiceKey(self._own, domain, chunk, service) for service in services)
-        return Built(place, Registered(provider, services, tuple(implements), info), keys)
+        return BuiltProvider(place, RegisteredProvider(provider, services, tuple(implements), info), keys)
 
-    def host(self, built: Built) -> None:
+    def host(self, built: BuiltProvider) -> None:
         """Offer what was built: callable first, then announced."""
         self._host(built.place, built.registered)
 
-    def discard(self, built: Built) -> None:
+    def discard(self, built: BuiltProvider) -> None:
         """Give back what was built and is not offered."""
         self._drop(built.services)
 
@@ -150,7 +150,7 @@ class Providers:
         self._access.require_offer(self._own.identity, info.groups, info.kind)
         domain, chunk = domain_of(info.groups), self._new_chunk(provider, info.kind)
         place = f"{domain}/{chunk}"
-        self._host(place, Registered(provider, make(place), (), info))
+        self._host(place, RegisteredProvider(provider, make(place), (), info))
         return domain, chunk
 
     def _new_chunk(self, provider: object, kind: str) -> str:
@@ -159,7 +159,7 @@ class Providers:
             self._counter += 1
             return f"{as_chunk(kind)[:60]}-{self._counter}"
 
-    def _host(self, place: str, registered: Registered) -> None:
+    def _host(self, place: str, registered: RegisteredProvider) -> None:
         with self._announcing:
             self._watch(place, registered.services)
             self._prepare(place, registered.services, registered.info)
@@ -221,7 +221,7 @@ class Providers:
                 self._drop(known.services)
             self._announce(place, info)
 
-    def _known(self, provider: object) -> tuple[str, Registered]:
+    def _known(self, provider: object) -> tuple[str, RegisteredProvider]:
         with self._lock:
             place = self._names.get(id(provider))
             if place is None:
@@ -306,10 +306,14 @@ class Providers:
         services = [service for hosted in list(self._hosted.values()) for service in hosted.services.values()]
         return sum(serial.waiting for serial in {service.serial for service in services} if serial is not None)
 
-    def offer(self, place: str) -> Offer | None:
+    def offer(self, place: str) -> ProviderOffer | None:
         """The provider registered at a place (``domain/provider``)."""
         known = self._hosted.get(place)
-        return None if known is None else Offer(known.provider, known.info.groups, known.implements, known.info.meta)
+        return (
+            None
+            if known is None
+            else ProviderOffer(known.provider, known.info.groups, known.implements, known.info.meta)
+        )
 
     def lookup(self, place: str, service: str) -> LocalService | None:
         """The service that a call names.

@@ -45,7 +45,7 @@ def checked_health(provider: object, health: str) -> str:
     return health
 
 
-class Registered(Struct, frozen=True):
+class RegisteredProvider(Struct, frozen=True):
     """A provider of this container."""
 
     provider: Any
@@ -55,7 +55,7 @@ class Registered(Struct, frozen=True):
     """As it was last announced."""
 
 
-class Offer(NamedTuple):
+class ProviderOffer(NamedTuple):
     """An object with its registration."""
 
     provider: object
@@ -64,11 +64,11 @@ class Offer(NamedTuple):
     meta: Mapping[str, Scalar]
 
 
-class Built(NamedTuple):
+class BuiltProvider(NamedTuple):
     """An object read into services that are not offered yet; it holds its resources."""
 
     place: str
-    registered: Registered
+    registered: RegisteredProvider
     keys: tuple[ServiceKey, ...]
 
     @property

@@ -19,11 +19,11 @@ Secret = Annotated[_T, _NOTE]
 """Marks an argument as secret: ``Secret[str]``. Its value appears in no error, traceback, log or description."""
 
 
-def is_secret(kind: Any) -> bool:
+def is_secret(type_: Any) -> bool:
     """Whether a parameter's annotation marks it as secret, in whatever form it is written."""
-    if any(note is _NOTE for note in getattr(kind, "__metadata__", ())):
+    if any(note is _NOTE for note in getattr(type_, "__metadata__", ())):
         return True
-    return any(map(is_secret, get_args(kind)))
+    return any(map(is_secret, get_args(type_)))
 
 
 def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: frozenset[str]) -> ErrorInfo:

@@ -248,17 +248,17 @@ def _parameters(where: str, function: Callable[..., Any]) -> list[inspect.Parame
     return every
 
 
-def _is_number(kind: Any) -> bool:
+def _is_number(type_: Any) -> bool:
     """Whether a type accepts numbers only, limited or not."""
-    return getattr(kind, "__origin__", kind) in (float, int, bool)
+    return getattr(type_, "__origin__", type_) in (float, int, bool)
 
 
-def _mentions_float(kind: Any) -> bool:
-    if kind is float or kind is Any:
+def _mentions_float(type_: Any) -> bool:
+    if type_ is float or type_ is Any:
         return True
-    if isinstance(kind, type) and kind.__module__ != "builtins":
+    if isinstance(type_, type) and type_.__module__ != "builtins":
         return True  # a struct: checked value by value
-    return any(_mentions_float(inner) for inner in getattr(kind, "__args__", ()))
+    return any(_mentions_float(inner) for inner in getattr(type_, "__args__", ()))
 
 
 def _finite(value: Any) -> bool:

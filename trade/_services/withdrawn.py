@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trade._resources.resource import Resource
 from trade._services.providers import Providers
-from trade._services.registration import Offer, checked_groups
+from trade._services.registration import ProviderOffer, checked_groups
 from trade.errors import ConfigurationError, DeviceFault
 from trade.protocol.keys import DOMAIN, ServiceKey
 
@@ -28,7 +28,7 @@ class WithdrawnProviders:
         self._providers: Final = providers
         self._rest: Final = rest
         self._lock = threading.Lock()
-        self._kept: dict[str, Offer] = {}
+        self._offers: dict[str, ProviderOffer] = {}
 
     def take_off(self, key: ServiceKey, moved_to: str = "") -> str:
         """Stop offering the provider of a service; returns the name under which it can be offered again.
@@ -47,7 +47,7 @@ class WithdrawnProviders:
         if problems := self._rest(self._providers.alone_with(offer.provider), "its services are withdrawn"):
             raise DeviceFault(device=key.provider, bus=key.address.container, fault="; ".join(problems))
         with self._lock:
-            self._kept[key.provider] = offer
+            self._offers[key.provider] = offer
         try:
             self._providers.remove(offer.provider, moved_to)
         except ConfigurationError:  # another thread was faster; perhaps its owner, which has the final say
@@ -62,8 +62,8 @@ class WithdrawnProviders:
             ConfigurationError: no such provider was withdrawn, or a malformed group.
         """
         with self._lock:
-            offer = self._kept.get(provider)
-            known = ", ".join(self._kept) or "none"
+            offer = self._offers.get(provider)
+            known = ", ".join(self._offers) or "none"
         if offer is None:
             problem = f"no provider of that name was withdrawn; there is {known}"
             raise ConfigurationError(where=provider, problem=problem)
@@ -75,18 +75,18 @@ class WithdrawnProviders:
     def forget(self, provider: object) -> bool:
         """Its owner registers or deregisters it; returns whether it was withdrawn."""
         with self._lock:
-            names = [name for name, offer in self._kept.items() if offer.provider is provider]
+            names = [name for name, offer in self._offers.items() if offer.provider is provider]
             for name in names:
-                del self._kept[name]
+                del self._offers[name]
         return bool(names)
 
-    def offer(self, provider: str) -> Offer | None:
+    def offer(self, provider: str) -> ProviderOffer | None:
         """The provider withdrawn under a name, with its registration."""
         with self._lock:
-            return self._kept.get(provider)
+            return self._offers.get(provider)
 
     def infos(self) -> list[WithdrawnInfo]:
         """The providers that can be offered again, by name."""
         with self._lock:
-            kept = sorted(self._kept.items())
+            kept = sorted(self._offers.items())
         return [WithdrawnInfo(name, type(offer.provider).__qualname__, offer.groups) for name, offer in kept]

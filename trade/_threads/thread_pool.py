@@ -72,8 +72,8 @@ class _Worker:
     def __init__(self, pool: ThreadPool) -> None:
         self._pool = pool
         self._work: Work | None = None
-        self._given = threading.Lock()
-        self._given.acquire()
+        self._handover = threading.Lock()
+        self._handover.acquire()
         self._thread: threading.Thread | None = None
 
     def give(self, work: Work, name: str) -> None:
@@ -83,18 +83,18 @@ class _Worker:
             self._thread.start()
         else:
             self._thread.name = name
-        self._given.release()
+        self._handover.release()
 
     def dismiss(self) -> None:
         """Ends an idle worker."""
-        self._given.release()
+        self._handover.release()
 
     def _main(self) -> None:
         while True:
-            if not self._given.acquire(timeout=_PATIENCE_S):
+            if not self._handover.acquire(timeout=_PATIENCE_S):
                 if self._pool.leave(self):
                     return
-                self._given.acquire()
+                self._handover.acquire()
             work, self._work = self._work, None
             if work is None:
                 return

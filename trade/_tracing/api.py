@@ -9,7 +9,7 @@ from msgspec import Struct
 from trade._calls.batch import Outcome
 from trade._calls.client import CallClient
 from trade._calls.everywhere import Everywhere, answers
-from trade._calls.handle import Bound, Handle
+from trade._calls.handle import BoundCall, Handle
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
 from trade.errors import NoSuchCall
@@ -51,7 +51,7 @@ class SystemLookup(Protocol):
     """Finds and calls services of the system, as a container does."""
 
     def everywhere(self, name: str, *, container: str = "*") -> Everywhere: ...
-    def call_all(self, which: Iterable[Handle | Bound], /) -> list[Outcome]: ...
+    def call_all(self, which: Iterable[Handle | BoundCall], /) -> list[Outcome]: ...
 
 
 class LogReader:

@@ -14,7 +14,7 @@ class TraceServices:
 
     def __init__(self, container: str, spans: Spans, switch: Callable[[bool], bool]) -> None:
         self._container = container
-        self._noted = spans
+        self._spans = spans
         self._switch = switch
 
     @service
@@ -25,7 +25,7 @@ class TraceServices:
     @service(effect="read")
     def spans(self, calls: list[int] | None = None, after: int = 0) -> list[Span]:
         """The spans after that number, of these calls and those they led to, or of all; oldest first."""
-        return self._noted.kept(None if calls is None else frozenset(calls), after)
+        return self._spans.kept(None if calls is None else frozenset(calls), after)
 
     @service(effect="read")
     def log_lines(self, after: int = 0) -> list[LogLine]:

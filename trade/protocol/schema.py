@@ -91,10 +91,10 @@ def types_text(kinds: Sequence[Any]) -> str:
     return msgspec.json.encode([list(schemas), definitions], order="sorted").decode()
 
 
-def _own_schema(kind: Any) -> dict[str, Any]:
-    name = getattr(kind, "__trade_type__", None)
+def _own_schema(type_: Any) -> dict[str, Any]:
+    name = getattr(type_, "__trade_type__", None)
     if name is None:
-        raise TypeError(f"{kind!r} is no plain data")
+        raise TypeError(f"{type_!r} is no plain data")
     return {"type": "object", "title": name, "x-trade-type": name}
 
 
@@ -126,10 +126,10 @@ def known_schema(data: bytes) -> _Schema:
     return read_schema(Raw(data))
 
 
-def read_json(text: str, kind: Any) -> Any:
+def read_json(text: str, type_: Any) -> Any:
     """A JSON text as one type; raises ValueError for another text."""
     try:
-        return msgspec.json.decode(text, type=kind)
+        return msgspec.json.decode(text, type=type_)
     except msgspec.DecodeError as bad:
         raise ValueError(str(bad)) from None
 
@@ -155,22 +155,22 @@ def schema_name(schema: _Schema) -> str:
     return str(schema.get("format") or ("bytes" if "contentEncoding" in schema else _NAMES.get(str(kind), "Any")))
 
 
-def type_text(kind: Any) -> str:
+def type_text(type_: Any) -> str:
     """A type in the notation of a person: without modules and ``typing``, with its limits in parentheses."""
-    if hasattr(kind, "__metadata__"):
-        limits = limits_text(kind.__metadata__)
-        return type_text(kind.__origin__) + (f" ({limits})" if limits else "")
-    if kind is None or kind is type(None):
+    if hasattr(type_, "__metadata__"):
+        limits = limits_text(type_.__metadata__)
+        return type_text(type_.__origin__) + (f" ({limits})" if limits else "")
+    if type_ is None or type_ is type(None):
         return "None"
-    if kind is Ellipsis:
+    if type_ is Ellipsis:
         return "..."
-    inner = [type_text(arg) for arg in getattr(kind, "__args__", ())]
-    origin = get_origin(kind)
+    inner = [type_text(arg) for arg in getattr(type_, "__args__", ())]
+    origin = get_origin(type_)
     if origin in (Union, types.UnionType):
         return " | ".join(inner)
     if origin is Literal:
-        return f"Literal[{', '.join(map(repr, kind.__args__))}]"
-    name = getattr(origin or kind, "__name__", str(kind))
+        return f"Literal[{', '.join(map(repr, type_.__args__))}]"
+    name = getattr(origin or type_, "__name__", str(type_))
     return f"{name}[{', '.join(inner)}]" if inner else name
 
 
@@ -187,12 +187,12 @@ def fits(given: _Schema, given_definitions: _Schema, wanted: _Schema, wanted_def
 
 class _Comparison:
     def __init__(self, given_definitions: _Schema, wanted_definitions: _Schema) -> None:
-        self._given = given_definitions
-        self._wanted = wanted_definitions
+        self._given_definitions = given_definitions
+        self._wanted_definitions = wanted_definitions
         self._known: dict[tuple[int, int], bool] = {}
 
     def fits(self, given: _Schema, wanted: _Schema) -> bool:
-        given, wanted = _resolved(given, self._given), _resolved(wanted, self._wanted)
+        given, wanted = _resolved(given, self._given_definitions), _resolved(wanted, self._wanted_definitions)
         pair = (id(given), id(wanted))
         if pair not in self._known:
             self._known[pair] = True  # a type that contains itself fits unless something else does not

@@ -41,20 +41,20 @@ _GENERIC: Final[tuple[Any, ...]] = (list, dict, tuple, set, frozenset)
 _annotated: Final[Any] = Annotated
 
 
-def noted(kind: Any) -> Any:
+def noted(type_: Any) -> Any:
     """The type with a note in its JSON Schema wherever the schema would lose information."""
-    origin: Any = get_origin(kind) or kind
-    inner = get_args(kind)
+    origin: Any = get_origin(type_) or type_
+    inner = get_args(type_)
     if origin is Annotated:
         return _annotated[(noted(inner[0]), *inner[1:])]
     if origin in (Union, types.UnionType):
         return reduce(or_, map(noted, inner))
     if inner and origin in _GENERIC:
-        kind = origin[tuple(part if part is Ellipsis else noted(part) for part in inner)]
+        type_ = origin[tuple(part if part is Ellipsis else noted(part) for part in inner)]
     fixed = origin is tuple and inner and inner[-1] is not Ellipsis
     if fixed or origin not in _NOTED.values():
-        return kind
-    return _annotated[kind, msgspec.Meta(extra_json_schema={_NOTE: origin.__name__})]
+        return type_
+    return _annotated[type_, msgspec.Meta(extra_json_schema={_NOTE: origin.__name__})]
 
 
 def type_from_schema(schema: Mapping[str, Any], known: Mapping[str, str]) -> Any:
@@ -71,7 +71,7 @@ class _Reader:
     def __init__(self, definitions: Mapping[str, Any], known: Mapping[str, str]) -> None:
         self._definitions = definitions
         self._known = known
-        self._made: dict[str, Any] = {}
+        self._types: dict[str, Any] = {}
 
     def read(self, schema: Mapping[str, Any]) -> Any:
         if "$ref" in schema:
@@ -95,11 +95,11 @@ class _Reader:
             case _:
                 return Any
 
-    def _array(self, schema: Mapping[str, Any], kind: Any) -> Any:
+    def _array(self, schema: Mapping[str, Any], type_: Any) -> Any:
         if "prefixItems" in schema:
             return tuple.__class_getitem__(tuple(self.read(item) for item in schema["prefixItems"]))
         item = self.read(schema["items"]) if "items" in schema else Any
-        return tuple[item, ...] if kind is tuple else (kind or list)[item]
+        return tuple[item, ...] if type_ is tuple else (type_ or list)[item]
 
     def _object(self, schema: Mapping[str, Any]) -> Any:
         if "x-trade-type" in schema:  # a value with its own encoding, such as a handle
@@ -110,12 +110,12 @@ class _Reader:
         return self._record(schema.get("title", "Record"), schema)
 
     def _definition(self, name: str) -> Any:
-        if name not in self._made:
-            self._made[name] = Any  # a type that contains itself: its inner occurrences stay plain data
+        if name not in self._types:
+            self._types[name] = Any  # a type that contains itself: its inner occurrences stay plain data
             definition = self._definitions.get(name, {})
             loaded = loaded_type(self._known.get(name, ""))
-            self._made[name] = loaded if loaded and _same_fields(loaded, definition) else self.read(definition)
-        return self._made[name]
+            self._types[name] = loaded if loaded and _same_fields(loaded, definition) else self.read(definition)
+        return self._types[name]
 
     def _record(self, title: str, schema: Mapping[str, Any]) -> Any:
         required = set(schema.get("required", ()))
@@ -141,17 +141,17 @@ def loaded_type(path: str) -> type | None:
     return found if fits else None
 
 
-def _same_fields(kind: type, definition: Mapping[str, Any]) -> bool:
+def _same_fields(type_: type, definition: Mapping[str, Any]) -> bool:
     """Whether our type of that name equals the remote one: different programs or versions may use one name."""
-    [_], definitions = msgspec.json.schema_components([kind], schema_hook=lambda _: {})
-    own = definitions.get(kind.__name__, {})
+    [_], definitions = msgspec.json.schema_components([type_], schema_hook=lambda _: {})
+    own = definitions.get(type_.__name__, {})
     return all(set(own.get(part, ())) == set(definition.get(part, ())) for part in ("properties", "required", "enum"))
 
 
-def name_of(kind: type) -> str:
+def name_of(type_: type) -> str:
     """``module:qualified name`` for other processes; types of the main program get the name of its module."""
-    module_name = _program() if kind.__module__ == _MAIN else kind.__module__
-    return f"{module_name}:{kind.__qualname__}"
+    module_name = _program() if type_.__module__ == _MAIN else type_.__module__
+    return f"{module_name}:{type_.__qualname__}"
 
 
 def publish(package: str, *kinds: type) -> None:

@@ -2,7 +2,7 @@
 
 from trade.protocol.schema_types import publish as _publish
 from trade.rules._engine import GROUP, DryRun, RuleInfo, Rules, rehearse
-from trade.rules._file import Condition, Occasion, Rule, Selection, Step, read_rules
+from trade.rules._file import Condition, Rule, RuleEvent, Selection, Step, read_rules
 from trade.rules._steps import Firing, StepResult
 
 __all__ = [
@@ -10,8 +10,8 @@ __all__ = [
     "Condition",
     "DryRun",
     "Firing",
-    "Occasion",
     "Rule",
+    "RuleEvent",
     "RuleInfo",
     "Rules",
     "Selection",

@@ -17,7 +17,7 @@ from trade._notifications.notification import Notification
 from trade._services.decorator import service
 from trade.protocol.messages import HEALTHY
 from trade.rules._file import Rule, read_rules
-from trade.rules._steps import TURNS, Firing, LoopDetector, Mark, StepResult, Way, done, fired, holds, turns
+from trade.rules._steps import TURNS, Firing, LoopDetector, RuleMark, StepResult, Way, done, fired, holds, turns
 
 GROUP: Final = "rules"
 MOST: Final = 5
@@ -116,17 +116,17 @@ class _ActiveRule:
 
     # --- events
 
-    def _happened(self, about: Handle) -> None:
+    def _happened(self, service: Handle) -> None:
         now = time.monotonic_ns()
-        if now < self._resting.get(about.label, 0):
+        if now < self._resting.get(service.label, 0):
             self._skipped += 1
-        elif self._holds(about)[0]:
-            self._fire(about, self._way_to(about.label, now))
+        elif self._holds(service)[0]:
+            self._fire(service, self._way_to(service.label, now))
 
-    def _altered(self, about: Handle) -> None:
+    def _altered(self, service: Handle) -> None:
         selection = self.rule.when.selection
-        if selection is not None and selection.constraint().matches(about.record):  # and still matches
-            self._happened(about)
+        if selection is not None and selection.constraint().matches(service.record):  # and still matches
+            self._happened(service)
 
     def _there(self, _about: Handle) -> None:
         self._not_so()
@@ -154,35 +154,35 @@ class _ActiveRule:
             return
         if self.rule.when.every_s is None or self.rule.if_ is not None:  # the clock has no cause
             self._way = self._way or self._way_to("", self._not_so_ns)
-        self._fire(about, self._way or (Mark(self.name),))
+        self._fire(about, self._way or (RuleMark(self.name),))
 
     def _not_so(self) -> None:
         self._not_so_ns, self._way = time.monotonic_ns(), ()
 
-    def _holds(self, about: Handle | None) -> tuple[bool, Handle | None]:
+    def _holds(self, service: Handle | None) -> tuple[bool, Handle | None]:
         try:
-            return holds(self._engine.container.client, self.rule.if_, about)
+            return holds(self._engine.container.client, self.rule.if_, service)
         except Exception as error:  # noqa: BLE001 - a condition that fails does not hold, and is reported
             self._fail(f"{type(error).__name__}: {error}")
-            return False, about
+            return False, service
 
     def _way_to(self, label: str, since_ns: int) -> Way:
-        return self._engine.causes.way_to(Mark(self.name, label), since_ns)
+        return self._engine.causes.way_to(RuleMark(self.name, label), since_ns)
 
     # --- firing
 
-    def _fire(self, about: Handle | None, way: Way) -> None:
+    def _fire(self, service: Handle | None, way: Way) -> None:
         loop = self._loop(way)
         if loop:
             self.end()
             self.why = loop
-            self._engine.note(self._firing(about, way, stopped=loop))
+            self._engine.note(self._firing(service, way, stopped=loop))
             return
-        firing, began = self._firing(about, way), time.monotonic_ns()
+        firing, began = self._firing(service, way), time.monotonic_ns()
         self._recent.append((began, way[-1].service))
         past = self._engine.causes.begin(way)
         try:
-            steps = done(self._engine.container.client, self.rule.do, about, dry_run=self._engine.dry_run)
+            steps = done(self._engine.container.client, self.rule.do, service, dry_run=self._engine.dry_run)
         finally:
             past.ended_ns = time.monotonic_ns()
         self._fired += 1
@@ -191,8 +191,8 @@ class _ActiveRule:
         self._rest(way[-1].service, past.ended_ns)
         self._engine.note(structs.replace(firing, steps=steps, took_s=(past.ended_ns - began) / 1e9))
 
-    def _firing(self, about: Handle | None, way: Way, *, stopped: str = "") -> Firing:
-        return fired(self.name, str(self.rule.when), about, way, dry_run=self._engine.dry_run, stopped=stopped)
+    def _firing(self, service: Handle | None, way: Way, *, stopped: str = "") -> Firing:
+        return fired(self.name, str(self.rule.when), service, way, dry_run=self._engine.dry_run, stopped=stopped)
 
     def _loop(self, way: Way) -> str:
         """Why it must not fire again; empty if it may."""

@@ -46,9 +46,9 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     meta: dict[str, Scalar] | None = None
     healthy: bool | None = None
 
-    def constraint(self, about: Handle | None = None) -> Constraint:
-        """The selection as a constraint; ``about``: the service of the event."""
-        container = about.container if about is not None and self.container == CONTAINER else self.container
+    def constraint(self, service: Handle | None = None) -> Constraint:
+        """The selection as a constraint; ``service``: that of the event."""
+        container = service.container if service is not None and self.container == CONTAINER else self.container
         return where(
             name=self.name,
             group=self.group,
@@ -64,7 +64,7 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         )
 
 
-class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class RuleEvent(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The event of a rule: exactly one of these."""
 
     joined: Selection | None = None
@@ -169,7 +169,7 @@ class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Rule(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"if_": "if"}):
     """One rule."""
 
-    when: Occasion
+    when: RuleEvent
     do: list[Step]
     if_: Condition | None = None
     cooldown_s: float = 0.0
@@ -210,23 +210,23 @@ def read_rules(path: Path, text: str | None = None) -> dict[str, Rule]:
     return rules
 
 
-def _converted(raw: Any, kind: Any, where: str, joint: str) -> Any:
+def _converted(raw: Any, type_: Any, where: str, joint: str) -> Any:
     try:
-        return msgspec.convert(raw, kind)
+        return msgspec.convert(raw, type_)
     except msgspec.ValidationError as bad:
         found = mismatch(bad)
     place = f"{where}{joint or ': '}{found.place}" if found.place else where
     if key := found.missing:
         raise ConfigurationError(where=place, problem=f"{key} is missing; write {_EXAMPLES.get(key, key)}")
     if found.unknown:
-        raise ConfigurationError(where=place, problem=f"has no {found.unknown!r}; {_known(found.place, kind)}")
+        raise ConfigurationError(where=place, problem=f"has no {found.unknown!r}; {_known(found.place, type_)}")
     raise ConfigurationError(where=place, problem=found.problem)
 
 
-def _known(path: str, kind: Any) -> str:
+def _known(path: str, type_: Any) -> str:
     """The valid keys at a place."""
     last = re.sub(r"\[.*?\]", "", path).rpartition(".")[2]
-    kinds: dict[str, Any] = {"": kind, "when": Occasion, "if": Condition, "do": Step}
+    kinds: dict[str, Any] = {"": type_, "when": RuleEvent, "if": Condition, "do": Step}
     return f"there is {', '.join(kinds.get(last, Selection).__struct_encode_fields__)}"
 
 
@@ -235,7 +235,7 @@ class _Check:
 
     def __init__(self, rule: Rule, at: str) -> None:
         self._rule = rule
-        self._at = at
+        self._location = at
 
     def all(self) -> None:
         rule = self._rule
@@ -309,7 +309,7 @@ class _Check:
             self._wrong(key, f"must be a number from {least:g} to {most:g}, not {value}")
 
     def _wrong(self, key: str, problem: str) -> None:
-        raise ConfigurationError(where=f"{self._at}.{key}", problem=problem)
+        raise ConfigurationError(where=f"{self._location}.{key}", problem=problem)
 
 
 def _texts(value: Any) -> list[str]:
@@ -320,12 +320,12 @@ def _texts(value: Any) -> list[str]:
     return [text for one in cast("list[Any]", value) for text in _texts(one)] if isinstance(value, list) else []
 
 
-def filled(value: Any, about: Handle | None) -> Any:
+def filled(value: Any, service: Handle | None) -> Any:
     """A value of the file with ``$service`` and ``$container`` replaced."""
     if isinstance(value, Mapping):
-        return {key: filled(one, about) for key, one in cast("Mapping[str, Any]", value).items()}
+        return {key: filled(one, service) for key, one in cast("Mapping[str, Any]", value).items()}
     if isinstance(value, list):
-        return [filled(one, about) for one in cast("list[Any]", value)]
-    if about is not None and isinstance(value, str):
-        return {SERVICE: about, CONTAINER: about.container}.get(value, value)
+        return [filled(one, service) for one in cast("list[Any]", value)]
+    if service is not None and isinstance(value, str):
+        return {SERVICE: service, CONTAINER: service.container}.get(value, value)
     return value

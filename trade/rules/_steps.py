@@ -21,18 +21,18 @@ _MOST: Final = 1000
 _LONGEST: Final = 64
 
 
-class Mark(NamedTuple):
+class RuleMark(NamedTuple):
     """A rule, and the service it fired for, if any."""
 
     rule: str
     service: str = ""
 
 
-Way = tuple[Mark, ...]
+Way = tuple[RuleMark, ...]
 """The causes of a firing, the first one first; it ends with the firing itself."""
 
 
-class Past:
+class RunFiring:
     """A firing that is running or over."""
 
     def __init__(self, way: Way) -> None:
@@ -45,11 +45,11 @@ class LoopDetector:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._past: deque[Past] = deque(maxlen=_MOST)
+        self._past: deque[RunFiring] = deque(maxlen=_MOST)
 
-    def begin(self, way: Way) -> Past:
+    def begin(self, way: Way) -> RunFiring:
         """A rule fires; the caller sets ``ended_ns`` at its end."""
-        past = Past(way)
+        past = RunFiring(way)
         with self._lock:
             self._past.append(past)
         return past
@@ -60,7 +60,7 @@ class LoopDetector:
             kept = [past for past in self._past if all(mark.rule != rule for mark in past.way)]
             self._past = deque(kept, maxlen=_MOST)
 
-    def way_to(self, mark: Mark, since_ns: int) -> Way:
+    def way_to(self, mark: RuleMark, since_ns: int) -> Way:
         """The possible causes of an event between two times, followed by the event."""
         with self._lock:
             latest = list(reversed(self._past))
@@ -113,12 +113,12 @@ class Firing(Struct, frozen=True, kw_only=True):
         return not self.stopped and not any(did.error for did in self.steps)
 
 
-def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: bool, stopped: str = "") -> Firing:
+def fired(rule: str, occasion: str, service: Handle | None, way: Way, *, dry_run: bool, stopped: str = "") -> Firing:
     """A firing that begins now."""
     return Firing(
         rule=rule,
         occasion=occasion,
-        service=about.label if about is not None else "",
+        service=service.label if service is not None else "",
         at=time.time(),
         led_by=tuple(mark.rule for mark in way[:-1]),
         dry_run=dry_run,
@@ -126,7 +126,7 @@ def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: 
     )
 
 
-def done(client: CallClient, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
+def done(client: CallClient, steps: Sequence[Step], service: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
     """Run steps one after the other, up to one that fails; after that, only those with ``always``.
 
     In a dry run each step is checked, and nothing is called.
@@ -138,26 +138,26 @@ def done(client: CallClient, steps: Sequence[Step], about: Handle | None, *, dry
         if failed and not step.always:
             continue
         try:
-            did = do(client, step, about)
+            did = do(client, step, service)
         except Exception as error:  # noqa: BLE001 - every error of a service is recorded
             did, failed = StepResult(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
         all_done.append(did)
     return tuple(all_done)
 
 
-def _do(client: CallClient, step: Step, about: Handle | None) -> StepResult:
+def _do(client: CallClient, step: Step, service: Handle | None) -> StepResult:
     if step.wait_for is not None:
-        found = client.find(step.wait_for.constraint(about), wait_s=step.s)
+        found = client.find(step.wait_for.constraint(service), wait_s=step.s)
         return StepResult(step=str(step), service=found.label, container=found.container)
-    handle = _called(client, step, about)
-    result = _call(handle.with_(deadline_s=step.deadline_s), step.args, about)
+    handle = _called(client, step, service)
+    result = _call(handle.with_(deadline_s=step.deadline_s), step.args, service)
     text = repr(result)[:_LONGEST_RESULT]
     return StepResult(step=str(step), service=handle.label, container=handle.container, result=text)
 
 
-def _rehearse(client: CallClient, step: Step, about: Handle | None) -> StepResult:
+def _rehearse(client: CallClient, step: Step, service: Handle | None) -> StepResult:
     if step.wait_for is not None:
-        found = client.services(step.wait_for.constraint(about))
+        found = client.services(step.wait_for.constraint(service))
         there = found[0] if found else None
         return StepResult(
             step=str(step),
@@ -165,33 +165,33 @@ def _rehearse(client: CallClient, step: Step, about: Handle | None) -> StepResul
             container=there.container if there else "",
             result="exists" if there else "would wait for it",
         )
-    handle = _called(client, step, about)
+    handle = _called(client, step, service)
     client.require_call(client.address.identity, handle)
     return StepResult(step=str(step), service=handle.label, container=handle.container, result="would be called")
 
 
-def _called(client: CallClient, step: Step, about: Handle | None) -> Handle:
+def _called(client: CallClient, step: Step, service: Handle | None) -> Handle:
     if step.call == SERVICE:
-        assert about is not None  # noqa: S101 - checked with the file
-        return about
+        assert service is not None  # noqa: S101 - checked with the file
+        return service
     assert isinstance(step.call, Selection)  # noqa: S101
-    return client.find(step.call.constraint(about), wait_s=0, pick=step.pick)
+    return client.find(step.call.constraint(service), wait_s=0, pick=step.pick)
 
 
-def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None) -> Any:
-    given = filled(args, about)
+def _call(handle: Handle, args: list[Any] | dict[str, Any], service: Handle | None) -> Any:
+    given = filled(args, service)
     return handle(**given) if isinstance(given, dict) else handle(*given)
 
 
-def holds(client: CallClient, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
+def holds(client: CallClient, condition: Condition | None, service: Handle | None) -> tuple[bool, Handle | None]:
     """Whether a rule's condition holds, and the service for its steps: the event's, else the condition's.
 
     Raises the errors of finding and calling the service.
     """
     if condition is None:
-        return True, about
-    handle = client.find(condition.service.constraint(about), wait_s=0)
+        return True, service
+    handle = client.find(condition.service.constraint(service), wait_s=0)
     if handle.effect != "read":
         problem = f"{handle.label} does not only read, so it is no condition"
         raise ConfigurationError(where=str(condition), problem=problem)
-    return condition.holds(_call(handle, condition.args, about)), handle if about is None else about
+    return condition.holds(_call(handle, condition.args, service)), handle if service is None else service

@@ -18,7 +18,7 @@ from trade._context.call_context import CallContext, running
 from trade._context.outgoing import Claim, holding
 from trade._context.sessions import speaking
 from trade._estop.deadman import NO_CLIENT
-from trade._federation.federation import Exposed, MemberSystem, inside, shown
+from trade._federation.federation import MemberSystem, ProviderPlace, inside, shown
 from trade._locks.api import LEASE_S
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._locks.remote_locks import SharedResource, Wanted
@@ -96,11 +96,11 @@ class BorderDirection:
         self._groups = tuple(groups)
         self._names = home.settings.system, remote.settings.system
         self._guests = GuestSessions(remote.federation, home, self._names[1])
-        self._offered: dict[Exposed, _Offered] = {}
-        self._origins: dict[Exposed, Exposed] = {}
+        self._offered: dict[ProviderPlace, _OfferedProvider] = {}
+        self._origins: dict[ProviderPlace, ProviderPlace] = {}
         """From places in the remote system to places at home."""
         self._resources: WeakValueDictionary[tuple[Address, str], SharedResource] = WeakValueDictionary()
-        self._refused: dict[Exposed, str] = {}
+        self._refused: dict[ProviderPlace, str] = {}
         self._codec = handle_codec(self._handle_out, self._handle_in)
         self._changed = threading.Event()
         self._leaving = ExitStack()
@@ -162,7 +162,7 @@ class BorderDirection:
                 self._complain(place, str(refused))
         self._refused = {place: why for place, why in self._refused.items() if place in there}
 
-    def _is_shared(self, place: Exposed, info: ProviderInfo) -> bool:
+    def _is_shared(self, place: ProviderPlace, info: ProviderInfo) -> bool:
         return SHARED_FROM not in info.meta and inside(place.domain, self._groups)
 
     def _described(self, info: ProviderInfo) -> ProviderInfo:
@@ -172,17 +172,17 @@ class BorderDirection:
         groups = shown(info, self._groups)
         return structs.replace(info, groups=groups, members=members, meta=meta, estops=())
 
-    def _offer(self, place: Exposed, info: ProviderInfo) -> None:
+    def _offer(self, place: ProviderPlace, info: ProviderInfo) -> None:
         home = MemberSystem(
             place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place)
         )
-        offered = _Offered(info)
+        offered = _OfferedProvider(info)
         offered.place = self._remote.federation.pass_on(offered.provider, info, home)
         self._origins[offered.place] = place
         self._offered[place] = offered
         self._refused.pop(place, None)
 
-    def _adopt(self, place: Exposed) -> Any:
+    def _adopt(self, place: ProviderPlace) -> Any:
         def adopt(here: str, there: str) -> SharedResource:
             key = place.address, here
             found = self._resources.get(key)
@@ -192,7 +192,7 @@ class BorderDirection:
 
         return adopt
 
-    def _withdraw(self, place: Exposed, offered: "_Offered") -> None:
+    def _withdraw(self, place: ProviderPlace, offered: "_OfferedProvider") -> None:
         """Stop the motion of the other system's clients first: afterwards they could not stop it."""
         del self._offered[place]
         with contextlib.suppress(ConfigurationError, ChannelClosed):  # it was done before, or everything is gone
@@ -200,7 +200,7 @@ class BorderDirection:
         self._guests.leave(place)
         self._origins.pop(offered.place, None)
 
-    def _complain(self, place: Exposed, reason: str) -> None:
+    def _complain(self, place: ProviderPlace, reason: str) -> None:
         if self._refused.get(place) != reason:
             self._refused[place] = reason
             _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, reason)
@@ -222,18 +222,18 @@ class BorderDirection:
         return self._home.handle(key)
 
     def _remote_of(self, key: ServiceKey) -> ServiceKey | None:
-        offered = self._offered.get(Exposed(key.address, key.domain, key.provider))
+        offered = self._offered.get(ProviderPlace(key.address, key.domain, key.provider))
         return None if offered is None else offered.place.service(key.name)
 
     def home_of(self, key: ServiceKey) -> ServiceKey | None:
         """The home service of a service offered in the remote system."""
-        place = self._origins.get(Exposed(key.address, key.domain, key.provider))
+        place = self._origins.get(ProviderPlace(key.address, key.domain, key.provider))
         return None if place is None else place.service(key.name)
 
     # --- calls and locks from the remote system, continued at home
 
     @contextlib.contextmanager
-    def _speaking(self, call: CallContext, what: Exposed | None) -> Generator[None]:
+    def _speaking(self, call: CallContext, what: ProviderPlace | None) -> Generator[None]:
         """Makes home calls on behalf of a remote call, under the locks that it carries."""
         if call.session == NO_CLIENT:  # the deadman of our own container: the stop is ours
             sessions, names = [], [str(self._home.address)]
@@ -303,10 +303,10 @@ class BorderDirection:
         self._leaving.close()
 
 
-class _Offered:
+class _OfferedProvider:
     """One provider, as it is offered in the other system."""
 
-    place: Exposed
+    place: ProviderPlace
 
     def __init__(self, info: ProviderInfo) -> None:
         self.info = info

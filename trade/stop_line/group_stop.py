@@ -150,7 +150,7 @@ class GroupStop:
         return structs.replace(found, failed=found.failed | unseen)
 
 
-class _Unseen(Presence):
+class _NoPresence(Presence):
     """A stop waits for no liveliness token: callees do not look for the one of its session."""
 
     def close(self) -> None: ...
@@ -158,7 +158,7 @@ class _Unseen(Presence):
 
 def session_for(own: Address, client: str) -> Session:
     """The session of stops that a container makes for a client, so that they latch what the container itself moves."""
-    return Session(own, f"{own}/{client_name(client)}.stop", _Unseen(), lambda _: None)
+    return Session(own, f"{own}/{client_name(client)}.stop", _NoPresence(), lambda _: None)
 
 
 StopFor = Callable[[str, str, float, Sequence[str]], StopReport]

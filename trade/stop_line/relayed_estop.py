@@ -31,7 +31,7 @@ class RelayedEstop:
         self._reports: list[EstopReport] = []
         self._changed = threading.Condition()
         others = [record for record in client.registry.select(where(name=ESTOP, group=DOMAIN)) if not record.local]
-        self._left = len(others[:_RELAYS])
+        self._unfinished = len(others[:_RELAYS])
         for record in others[:_RELAYS]:
             words = (client.handle_of(record), (reason, estop_id, limit_s))
             threading.Thread(target=self._ask, args=words, name="trade-estop-ask", daemon=True).start()
@@ -42,7 +42,7 @@ class RelayedEstop:
             found = [as_seen_here(msgspec.convert(handle(*words), EstopReport))]
         with self._changed:
             self._reports += found
-            self._left -= 1
+            self._unfinished -= 1
             self._changed.notify_all()
 
     def report(self) -> EstopReport:
@@ -53,5 +53,5 @@ class RelayedEstop:
     def wait(self) -> EstopReport:
         """Waits until all have answered, or the time is over."""
         with self._changed:
-            self._changed.wait_for(lambda: self._left == 0, max(0.0, self._until - time.monotonic()))
+            self._changed.wait_for(lambda: self._unfinished == 0, max(0.0, self._until - time.monotonic()))
         return self.report()

@@ -7,15 +7,15 @@ from trade.testing._losses import LossConformance, Severable
 from trade.testing._system import MemorySystem, memory_system
 from trade.testing._transports import TransportConformance
 from trade.testing.virtual import Deadlock, VirtualTime, VirtualTimeError, virtual_time
-from trade.transport.memory import Clock, InFlightMessage, Kind, Network
+from trade.transport.memory import Clock, InFlightMessage, MessageKind, Network
 
 __all__ = [
     "Clock",
     "Deadlock",
     "InFlightMessage",
-    "Kind",
     "LossConformance",
     "MemorySystem",
+    "MessageKind",
     "Network",
     "Severable",
     "TransportConformance",

@@ -20,7 +20,7 @@ class RecordingListener:
 
     def __init__(self, channel: Channel, *, readers: int = 1) -> None:
         self.channel: Final = channel
-        self._heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._threads = [threading.Thread(target=self._hear, name="ear", daemon=True) for _ in range(readers)]
         for thread in self._threads:
             thread.start()
@@ -28,7 +28,7 @@ class RecordingListener:
     def _hear(self) -> None:
         while True:
             try:
-                self._heard.put(self.channel.receive())
+                self._messages.put(self.channel.receive())
             except ChannelClosed:
                 return
 
@@ -39,7 +39,7 @@ class RecordingListener:
             AssertionError: no message came.
         """
         try:
-            return self._heard.get(timeout=PATIENCE_S)
+            return self._messages.get(timeout=PATIENCE_S)
         except queue.Empty:
             raise AssertionError(f"nothing was heard for {PATIENCE_S} s") from None
 
@@ -57,7 +57,7 @@ class RecordingListener:
         return not any(thread.is_alive() for thread in self._threads)
 
 
-class Teller:
+class RegistryResponder:
     """Answers queries with announcements, on its own thread, which ends when the transport closes."""
 
     def __init__(self, transport: Transport, pattern: str, standing: Mapping[str, bytes]) -> None:

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
+from trade.testing._ear import PATIENCE_S, RecordingListener, RegistryResponder, meet
 from trade.transport.base import Message, Transport
 
 
@@ -47,8 +47,8 @@ class LossConformance(ABC):
     def test_once_a_liveliness_token_is_back_all_current_entries_are_sent_on_request(self) -> None:
         with self.severable() as (one, other, sever, reconnect):
             standing = {f"shop/{number}": b"1" for number in range(50)}
-            Teller(one, "shop/*", standing)
-            lost = _Lost(one, other, sever)
+            RegistryResponder(one, "shop/*", standing)
+            lost = _LostPeer(one, other, sever)
             del standing["shop/49"]
             reconnect()
             assert lost.returns()
@@ -69,7 +69,7 @@ class LossConformance(ABC):
     def test_once_a_sign_has_risen_again_announcements_are_heard_as_before(self) -> None:
         with self.severable() as (one, other, sever, reconnect):
             ear = RecordingListener(other.announcements("shop/**"))
-            lost = _Lost(one, other, sever)
+            lost = _LostPeer(one, other, sever)
             one.announce("shop/bread", b"missed")
             reconnect()
             assert lost.returns()
@@ -80,14 +80,14 @@ class LossConformance(ABC):
     def test_once_a_sign_has_risen_again_messages_arrive_as_before(self) -> None:
         with self.severable() as (one, other, sever, reconnect):
             ear, publisher = RecordingListener(one.subscribe("room/a")), other.publish("room/a")
-            lost = _Lost(one, other, sever)
+            lost = _LostPeer(one, other, sever)
             reconnect()
             assert lost.returns()
             publisher.put(b"after")
             assert ear.next() == Message("room/a", b"after")
 
 
-class _Lost:
+class _LostPeer:
     """The first of two transports, lost to the second; knows when it is back."""
 
     def __init__(self, one: Transport, other: Transport, sever: Callable[[], None]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
-from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
+from trade.testing._ear import PATIENCE_S, RecordingListener, RegistryResponder, meet
 from trade.transport.base import ChannelClosed, Message, Transport
 
 
@@ -65,8 +65,8 @@ class StandingConformance(ABC):
     def test_a_query_gets_all_current_entries_of_each_member_that_answers(self) -> None:
         with self.network() as open_transport:
             one, other = open_transport(), open_transport()
-            Teller(one, "shop/one/*", {"shop/one/bread": b"fresh", "shop/one/milk": b"cold"})
-            Teller(other, "shop/other/*", {"shop/other/eggs": b"12"})
+            RegistryResponder(one, "shop/one/*", {"shop/one/bread": b"fresh", "shop/one/milk": b"cold"})
+            RegistryResponder(other, "shop/other/*", {"shop/other/eggs": b"12"})
             _signs = one.appear("alive/one"), other.appear("alive/other")
             late = open_transport()
             _wait_for(late, 2)
@@ -81,7 +81,7 @@ class StandingConformance(ABC):
         with self.pair() as (one, other):
             signs = RecordingListener(other.presences("alive/*"))
             for turn in range(50):
-                Teller(one, f"shop-{turn}/*", {f"shop-{turn}/bread": b"fresh"})
+                RegistryResponder(one, f"shop-{turn}/*", {f"shop-{turn}/bread": b"fresh"})
                 sign = one.appear(f"alive/{turn}")
                 signs.until(f"alive/{turn}", b"")
                 [answer] = other.ask(f"shop-{turn}/*", PATIENCE_S)
@@ -91,22 +91,22 @@ class StandingConformance(ABC):
     def test_ten_thousand_entries_are_sent_in_order(self) -> None:
         with self.pair() as (one, other):
             standing = {f"shop/{number}": str(number).encode() * 100 for number in range(10_000)}
-            Teller(one, "shop/*", standing)
+            RegistryResponder(one, "shop/*", standing)
             meet(listener=one, speaker=other)
             [answer] = other.ask("shop/**", 6 * PATIENCE_S)
             assert [(message.key, message.payload) for message in answer.messages] == list(standing.items())
 
     def test_only_the_requested_entries_are_sent_by_the_members_that_were_asked(self) -> None:
         with self.pair() as (one, other):
-            Teller(one, "shop/*/one/*", {"shop/food/one/bread": b"fresh", "shop/tools/one/saw": b"sharp"})
-            Teller(one, "bank/*", {"shop/food/one/poison": b"", "bank/money": b"1"})
+            RegistryResponder(one, "shop/*/one/*", {"shop/food/one/bread": b"fresh", "shop/tools/one/saw": b"sharp"})
+            RegistryResponder(one, "bank/*", {"shop/food/one/poison": b"", "bank/money": b"1"})
             meet(listener=one, speaker=other)
             [answer] = other.ask("shop/food/one/*", PATIENCE_S)
             assert answer.messages == [Message("shop/food/one/bread", b"fresh")]
 
     def test_no_member_queries_itself(self) -> None:
         with self.pair() as (one, _):
-            Teller(one, "shop/*", {"shop/bread": b"fresh"})
+            RegistryResponder(one, "shop/*", {"shop/bread": b"fresh"})
             assert one.ask("shop/**", PATIENCE_S) == []
 
     def test_a_question_that_is_not_ended_ends_at_its_deadline_with_what_was_said(self) -> None:
@@ -162,7 +162,7 @@ class StandingConformance(ABC):
 
     def test_who_is_closed_is_asked_nothing(self) -> None:
         with self.pair() as (one, other):
-            teller = Teller(one, "shop/*", {"shop/bread": b"fresh"})
+            teller = RegistryResponder(one, "shop/*", {"shop/bread": b"fresh"})
             meet(listener=one, speaker=other)
             assert len(other.ask("shop/*", PATIENCE_S)) == 1
             teller.questions.close()

@@ -10,7 +10,7 @@ from typing import Final
 
 from trade._container.container import Container
 from trade._settings import Settings
-from trade.transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
+from trade.transport.memory import Clock, InFlightMessage, MemoryTransport, MessageKind, Network
 from trade.transport.memory.node import Node
 
 _TAKING_NOTE_S: Final = 10.0
@@ -152,7 +152,7 @@ class MemorySystem:
 
     # --- messages
 
-    def sent(self, *kinds: Kind) -> int:
+    def sent(self, *kinds: MessageKind) -> int:
         """The number of messages between containers so far, of these kinds or of all."""
         return sum(count for kind, count in self.network.sent.items() if kind in kinds or not kinds)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 
-class _Counted:
+class _CountedConnection:
     """A connection that is counted until it is closed."""
 
     def __init__(self, connection: socket.socket, closed: Callable[[], None]) -> None:
@@ -42,7 +42,7 @@ class BoundedListener:
 
     def __init__(self, bound: socket.socket, most: int) -> None:
         self._bound: Final = bound
-        self._most: Final = most
+        self._limit: Final = most
         self._open = 0
         self._guard = threading.Lock()
 
@@ -53,12 +53,12 @@ class BoundedListener:
         """Raises BlockingIOError: the limit is reached; the new connection was closed."""
         made, address = self._bound.accept()
         with self._guard:
-            taken = self._open < self._most
+            taken = self._open < self._limit
             self._open += taken
         if not taken:
             made.close()
             raise BlockingIOError
-        return _Counted(made, self._closed), address
+        return _CountedConnection(made, self._closed), address
 
     def _closed(self) -> None:
         with self._guard:

@@ -26,7 +26,7 @@ _MULTICAST: Final = 0x1000
 _FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 
 
-class Own(NamedTuple):
+class OwnAddress(NamedTuple):
     """One address of this host."""
 
     ip: str
@@ -62,15 +62,15 @@ class Own(NamedTuple):
         return ipaddress.ip_address(ip) in ipaddress.ip_network(f"{self.ip}/{self.bits}", strict=False)
 
 
-def own_addresses() -> list[Own]:
+def own_addresses() -> list[OwnAddress]:
     """The addresses of this host, in the kernel's order."""
     if sys.platform != "linux":
         found = socket.getaddrinfo(socket.gethostname(), 0, type=socket.SOCK_STREAM)
-        return [Own(str(info[4][0]), 128 if info[0] == socket.AF_INET6 else 32, 0) for info in found]
+        return [OwnAddress(str(info[4][0]), 128 if info[0] == socket.AF_INET6 else 32, 0) for info in found]
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as kernel:
         kernel.settimeout(1.0)
         kernel.send(_HEADER.pack(_HEADER.size + 1, _DUMP_ADDRESSES, _REQUEST_DUMP, 1, 0) + bytes(1))
-        addresses: list[Own] = []
+        addresses: list[OwnAddress] = []
         while True:
             for kind, body in _messages(kernel.recv(1 << 16)):
                 if kind == _DONE:
@@ -86,7 +86,7 @@ def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[max((size + 3) & ~3, _HEADER.size) :]
 
 
-def _read(body: bytes) -> Iterator[Own]:
+def _read(body: bytes) -> Iterator[OwnAddress]:
     family, bits, _, _, interface = _ABOUT.unpack_from(body)
     if family not in _FAMILIES:
         return
@@ -97,7 +97,7 @@ def _read(body: bytes) -> Iterator[Own]:
         rest = rest[max((size + 3) & ~3, _ATTRIBUTE.size) :]
     raw = values.get(_LOCAL) or values.get(_ADDRESS)  # of a point-to-point link, the other one is the peer's
     if raw:
-        yield Own(socket.inet_ntop(family, raw), bits, interface)
+        yield OwnAddress(socket.inet_ntop(family, raw), bits, interface)
 
 
 def is_near(host: str) -> bool:

@@ -54,7 +54,7 @@ class PortGuard:
     def __init__(self, ports: Iterable[int], links: Callable[[], int], most: int = MOST_STRANGERS) -> None:
         self._ports = frozenset(ports)
         self._links = links
-        self._most = most
+        self._limit = most
         self._sockets = _listening(self._ports) if sys.platform == "linux" and _OPEN_FILES.is_dir() else []
         self._shut = frozenset[int]()
         """The sockets that accept no new connection now, by their places."""
@@ -88,16 +88,16 @@ class PortGuard:
             _logger.debug("the ports of the transport cannot be inspected: %s", bad)
             return
         strangers, new, self._known = len(there) - self._links(), there - self._known, there
-        if self._flood is None and strangers > self._most // 2:
+        if self._flood is None and strangers > self._limit // 2:
             self._flood = _Flood(now, ", ".join(map(str, sorted(self._ports))), there)
         elif self._flood is not None:
             self._flood.note(new)
-        if strangers <= self._most // 2:
+        if strangers <= self._limit // 2:
             self._filter(frozenset())
-        elif strangers > self._most:
-            crowded = {place for place, sock in enumerate(self._sockets) if _count(sock, there) > self._most // 2}
+        elif strangers > self._limit:
+            crowded = {place for place, sock in enumerate(self._sockets) if _count(sock, there) > self._limit // 2}
             self._filter(self._shut | crowded)
-        if self._flood is not None and self._flood.log_due(now, strangers, self._most, shut=bool(self._shut)):
+        if self._flood is not None and self._flood.log_due(now, strangers, self._limit, shut=bool(self._shut)):
             self._flood = None
 
     def _filter(self, shut: frozenset[int]) -> None:
@@ -173,12 +173,12 @@ class _Flood:
         self._began = self._last = now
         self._ports = ports
         self._logged = False
-        self._came = Counter[str]()
+        self._arrivals = Counter[str]()
         self.note(ends)
 
     def note(self, ends: Iterable[tuple[str, str]]) -> None:
         """These connections are new."""
-        self._came.update(end.partition(":")[0] for end, _ in ends)
+        self._arrivals.update(end.partition(":")[0] for end, _ in ends)
 
     def log_due(self, now: float, strangers: int, most: int, *, shut: bool) -> bool:
         """Logs what is due; returns whether it is over."""
@@ -202,7 +202,7 @@ class _Flood:
 
     def _sources(self, now: float) -> str:
         """How many were let in, how fast, and where most are from."""
-        (source, count), total = self._came.most_common(1)[0], self._came.total()
+        (source, count), total = self._arrivals.most_common(1)[0], self._arrivals.total()
         rate = total / max(now - self._began, _LOOK_S)
         return f"{total} were let in, {rate:.0f} a second, {count} of them from {_address(source)}"
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
-from trade.transport.interfaces import Own, own_addresses
+from trade.transport.interfaces import OwnAddress, own_addresses
 
 _logger = logging.getLogger("trade")
 
@@ -102,7 +102,7 @@ def scout(for_s: float, ended: Callable[[], bool], *, here_only: bool) -> Iterat
                         yield found
 
 
-def _asked(here_only: bool, known: Sequence[Own]) -> list[Own]:
+def _asked(here_only: bool, known: Sequence[OwnAddress]) -> list[OwnAddress]:
     return [own for own in known if ":" not in own.ip and own.loopback == here_only and own.multicasts]
 
 
@@ -118,7 +118,7 @@ class Beacon:
     def __init__(
         self,
         session: str,
-        locators: Callable[[list[Own], str], list[str]],
+        locators: Callable[[list[OwnAddress], str], list[str]],
         *,
         here_only: bool,
     ) -> None:

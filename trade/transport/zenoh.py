@@ -209,10 +209,10 @@ class ZenohQuestion(Question):
 
     def __init__(self, query: zenoh.Query) -> None:
         self._query = query
-        self._asked = query.key_expr
+        self._query_key = query.key_expr
 
     def answer(self, key: str, payload: bytes) -> None:
-        if not self._asked.intersects(key):
+        if not self._query_key.intersects(key):
             return
         try:
             self._query.reply(key, payload)

@@ -24,7 +24,7 @@ from trade.errors import ConfigurationError
 from trade.transport.addresses import ACCEPTS
 from trade.transport.credentials import dictionary_file
 from trade.transport.endpoints import Endpoint, dialled_from_here, loopback_interface
-from trade.transport.interfaces import Own, own_addresses
+from trade.transport.interfaces import OwnAddress, own_addresses
 from trade.transport.scouting import PEER, ROUTER, Beacon, scout
 from trade.transport.zenoh_prompt import Prompt
 
@@ -75,7 +75,7 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-class Found(NamedTuple):
+class FoundContainer(NamedTuple):
     """A discoverable container of this system."""
 
     session: str
@@ -83,7 +83,7 @@ class Found(NamedTuple):
     endpoints: tuple[str, ...]
 
 
-class Joined(NamedTuple):
+class LinkAttempt(NamedTuple):
     """What came of an attempt to link."""
 
     session: str
@@ -92,7 +92,7 @@ class Joined(NamedTuple):
     """Why not, as far as it is known."""
 
 
-class _There(NamedTuple):
+class _AddressOwner(NamedTuple):
     """Who listens at an address."""
 
     endpoint: str
@@ -210,7 +210,7 @@ class Links:
         self._check_here()
         return Beacon(self._beacon_id, self._locators, here_only=self._here_only)
 
-    def _locators(self, known: list[Own], asker: str) -> list[str]:
+    def _locators(self, known: list[OwnAddress], asker: str) -> list[str]:
         """Where others can dial the main session now, best first for who asks."""
         ips = [own.ip for own in known if own.dialled] or [own.ip for own in known if own.loopback]
         shared = {own.ip for own in known if own.reaches(asker)}
@@ -223,7 +223,7 @@ class Links:
             found += [f"{own.protocol}/{host}:{own.port}" for host in hosts]
         return found
 
-    def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
+    def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[FoundContainer]:
         """Scouts for containers; yields each discoverable container of this system once."""
         self._check_here()
         seen = {self._beacon_id}
@@ -233,7 +233,7 @@ class Links:
                 with contextlib.suppress(ConfigurationError, ValueError):  # any program may answer
                     yield _found(beacon, locators)
 
-    def join(self, endpoint: str, session: str, wait_s: float, ended: Callable[[], bool]) -> Joined:
+    def join(self, endpoint: str, session: str, wait_s: float, ended: Callable[[], bool]) -> LinkAttempt:
         """Link the main session with the one that listens there.
 
         Args:
@@ -244,18 +244,18 @@ class Links:
         """
         there = self._ask_who(endpoint, wait_s, ended)
         if not there.session:
-            return Joined("", f"{ACCEPTS}, but not this container")
+            return LinkAttempt("", f"{ACCEPTS}, but not this container")
         if there.session == self._own:
-            return Joined("", "this container itself")
+            return LinkAttempt("", "this container itself")
         if not there.session.startswith(session):
-            return Joined("", f"another container answers now ({there.session[:_NAME]})")
+            return LinkAttempt("", f"another container answers now ({there.session[:_NAME]})")
         ways = [self._introduced, self._prompted]
         if self._prompt is not None and not self.bridges and (self.moved() or _dials_first(self._own, there)):
             ways.reverse()
         for way in ways:
             if self.linked(there.session) or way(there, wait_s, ended):
-                return Joined(there.session)
-        return Joined("", f"{ACCEPTS} and this container, but no link was made in time")
+                return LinkAttempt(there.session)
+        return LinkAttempt("", f"{ACCEPTS} and this container, but no link was made in time")
 
     def moved(self) -> bool:
         """Whether others would dial addresses that this host had when it started, and that are not all of today's."""
@@ -276,21 +276,21 @@ class Links:
                 "the addresses of this host changed: %s. Those that dial a name, and discovery, find it there", changed
             )
 
-    def _ask_who(self, endpoint: str, wait_s: float, ended: Callable[[], bool]) -> _There:
+    def _ask_who(self, endpoint: str, wait_s: float, ended: Callable[[], bool]) -> _AddressOwner:
         asking = self._beside(endpoint)
         try:
             until = time.monotonic() + wait_s
             while time.monotonic() < until and not ended():
                 if routers := sorted(_routers(asking)):
-                    return _There(endpoint, routers[0], ROUTER)
+                    return _AddressOwner(endpoint, routers[0], ROUTER)
                 if others := _others(asking):
-                    return _There(endpoint, others[0])
+                    return _AddressOwner(endpoint, others[0])
                 time.sleep(_LOOK_S)
-            return _There(endpoint)
+            return _AddressOwner(endpoint)
         finally:
             _close(asking)
 
-    def _introduced(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+    def _introduced(self, there: _AddressOwner, wait_s: float, ended: Callable[[], bool]) -> bool:
         """By a session that is linked to both: of the two, the one that dials first dials what the other listened on
         when it started.
         """
@@ -300,13 +300,13 @@ class Links:
         finally:
             _close(helper)
 
-    def _prompted(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+    def _prompted(self, there: _AddressOwner, wait_s: float, ended: Callable[[], bool]) -> bool:
         """By the main session itself, which dials exactly there."""
         if self._prompt is None or not self._prompt.dial(there.session, [there.endpoint], there.kind):
             return False
         return self._wait_linked(there, wait_s, ended)
 
-    def _wait_linked(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+    def _wait_linked(self, there: _AddressOwner, wait_s: float, ended: Callable[[], bool]) -> bool:
         until = time.monotonic() + wait_s
         while not (linked := self.linked(there.session)) and time.monotonic() < until and not ended():
             time.sleep(_LOOK_S)
@@ -359,7 +359,7 @@ def _dialled() -> set[str]:
     return {own.ip for own in own_addresses() if own.dialled}
 
 
-def _dials_first(own: str, there: _There) -> bool:
+def _dials_first(own: str, there: _AddressOwner) -> bool:
     """Whether, of two sessions that hear of each other, this one dials: its id is the greater, last byte first."""
     mine, other = (bytes.fromhex(session.zfill(_DIGITS))[::-1] for session in (own, there.session))
     return there.kind == ROUTER or mine > other
@@ -377,10 +377,10 @@ def _close(extra: zenoh.Session) -> None:
     closing.join(_MOMENT_S)
 
 
-def _found(beacon: str, locators: Iterable[str]) -> Found:
+def _found(beacon: str, locators: Iterable[str]) -> FoundContainer:
     port = int(beacon[_TAG + _NAME :], 16)
     endpoints = (Endpoint.read(locator)._replace(port=port) for locator in locators)
-    return Found(beacon[_TAG:][:_NAME], tuple(map(str, endpoints)))
+    return FoundContainer(beacon[_TAG:][:_NAME], tuple(map(str, endpoints)))
 
 
 def _tag(settings: dict[str, Any]) -> str:

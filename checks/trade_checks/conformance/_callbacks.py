@@ -13,7 +13,7 @@ from trade.protocol.messages import Status
 from trade_checks.conformance._assertions import eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage
-from trade_checks.conformance._raw_client import DEADLINE_S, Voice, error_of
+from trade_checks.conformance._raw_client import DEADLINE_S, RawClient, error_of
 
 _EXTENSION = 1
 _SHORT_S = 2.0
@@ -77,8 +77,8 @@ def _handle(stage: Stage, name: str) -> msgspec.msgpack.Ext:
     return msgspec.msgpack.Ext(_EXTENSION, msgspec.msgpack.encode(key))
 
 
-def _relay(stage: Stage, who: Voice, name: str, resources: list[str], args: list[Any], **how: Any) -> int:
-    return who.call(stage.peer.place("relay"), "relay", _handle(stage, name), resources, args, **how)
+def _relay(stage: Stage, client: RawClient, name: str, resources: list[str], args: list[Any], **how: Any) -> int:
+    return client.call(stage.peer.place("relay"), "relay", _handle(stage, name), resources, args, **how)
 
 
 @check("calls", "Expiry", still=True)

@@ -24,7 +24,7 @@ from trade.transport.endpoints import free_endpoint
 from trade.transport.zenoh import ZenohTransport, configuration
 from trade_checks.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
 from trade_checks.conformance._peer import Peer, end_group
-from trade_checks.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice
+from trade_checks.conformance._raw_client import NEVER, PARTING_S, SYSTEM, RawClient
 
 IDENTITY: Final = "peer"
 NAME: Final = "peer"
@@ -219,21 +219,21 @@ class Stage:
 
     # --- clients
 
-    def voice(self, identity: str = "anna", *, client: str = "1") -> Voice:
+    def voice(self, identity: str = "anna", *, client: str = "1") -> RawClient:
         """A client that sends it raw messages; the caller closes it."""
-        return Voice(self._transport, identity, self.peer.address, client=client, motion=self.motion)
+        return RawClient(self._transport, identity, self.peer.address, client=client, motion=self.motion)
 
     # --- the arm
 
-    def angle(self, client: Voice) -> float:
+    def angle(self, client: RawClient) -> float:
         """The angle of its arm in rad."""
         return float(client.result(self.peer.arm, "angle", expires_ns=NEVER))
 
-    def turns(self, client: Voice) -> int:
+    def turns(self, client: RawClient) -> int:
         """The number of turns that have begun since its boot."""
         return int(client.result(self.peer.arm, "turns", expires_ns=NEVER))
 
-    def begin_turn(self, client: Voice, **how: Any) -> int:
+    def begin_turn(self, client: RawClient, **how: Any) -> int:
         """Starts a long turn; returns the call's id once the arm moves. Raises NotHeld if it does not."""
         away_rad = self.far_rad(client)
         call_id = client.call(self.peer.arm, "turn", away_rad, expires_ns=client.expiry_ns(60.0), **how)
@@ -246,18 +246,18 @@ class Stage:
         eventually(moves, "angle() does not show the requested turn")
         return call_id
 
-    def far_rad(self, client: Voice) -> float:
+    def far_rad(self, client: RawClient) -> float:
         """An angle that takes half a minute to reach."""
         return -30.0 if self.angle(client) > 0 else 30.0
 
-    def moves(self, client: Voice) -> bool:
+    def moves(self, client: RawClient) -> bool:
         """Whether the arm moves now."""
         before = self.angle(client)
         threading.Event().wait(_LOOK_S)
         return self.angle(client) != before
 
     @contextlib.contextmanager
-    def stopping(self, client: Voice, after: str) -> Generator[None, None, None]:
+    def stopping(self, client: RawClient, after: str) -> Generator[None, None, None]:
         """Raises NotHeld unless the arm comes to rest in time after the stop begins, and stays there.
 
         The stop must not wait for its answer, which may arrive after the arm has to rest.
@@ -266,7 +266,7 @@ class Stage:
         yield
         self.require_rest(client, after, since)
 
-    def require_rest(self, client: Voice, after: str, since: float) -> None:
+    def require_rest(self, client: RawClient, after: str, since: float) -> None:
         """Raises NotHeld unless the arm rests in time after that moment of time.monotonic(), and stays there."""
         limit_s, before = STOPPED_S + SLACK_S, self.angle(client)
         while True:
@@ -280,11 +280,11 @@ class Stage:
         threading.Event().wait(_STILL_S)
         require(self.angle(client) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
 
-    def acquire(self, client: Voice, resources: Sequence[str], **terms: Any) -> Any:
+    def acquire(self, client: RawClient, resources: Sequence[str], **terms: Any) -> Any:
         """Requests a lock; returns the answer."""
         return client.ask(SYSTEM, "acquire", list(resources), terms)
 
-    def granted(self, client: Voice, resources: Sequence[str], **terms: Any) -> Token:
+    def granted(self, client: RawClient, resources: Sequence[str], **terms: Any) -> Token:
         """Takes a lock; raises NotHeld if it is not granted."""
         found = client.result(SYSTEM, "acquire", list(resources), terms)
         try:

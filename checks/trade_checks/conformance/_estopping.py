@@ -13,13 +13,13 @@ from trade_checks.conformance._assertions import PATIENCE_S, eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage
 from trade_checks.conformance._peer import GROUP
-from trade_checks.conformance._raw_client import NEVER, SYSTEM, Voice, error_of
+from trade_checks.conformance._raw_client import NEVER, SYSTEM, RawClient, error_of
 
 _CONFIRMED_WITHIN_S = 3.0
 _WATCHED_S = 0.5
 
 
-def _open(client: Voice, reason: str = "a check") -> EstopOrder:
+def _open(client: RawClient, reason: str = "a check") -> EstopOrder:
     name = secrets.token_hex(4)
     return EstopOrder(PROTOCOL, name, Estop(name, client.session, reason, time.time()))
 
@@ -28,12 +28,12 @@ def _cleared(*orders: EstopOrder) -> EstopOrder:
     return EstopOrder(PROTOCOL, secrets.token_hex(4), None, tuple(order.request for order in orders))
 
 
-def _order(stage: Stage, client: Voice, order: EstopOrder) -> EstopConfirmed:
+def _order(stage: Stage, client: RawClient, order: EstopOrder) -> EstopConfirmed:
     """Sends an order until it is confirmed; raises NotHeld if it is not."""
     return _confirmed(stage, client, order.request, encode_message(order))
 
 
-def _confirmed(stage: Stage, client: Voice, request: str, payload: bytes) -> EstopConfirmed:
+def _confirmed(stage: Stage, client: RawClient, request: str, payload: bytes) -> EstopConfirmed:
     address = stage.peer.address
     with stage.listening(estop_confirmed_key(address)) as heard:
         found: list[EstopConfirmed] = []
@@ -60,7 +60,7 @@ def _shown(stage: Stage) -> tuple[str, ...]:
     return tuple(estop.id for (domain, _), info in entries.items() if domain == SYSTEM[0] for estop in info.estops)
 
 
-def _require_stopped(stage: Stage, client: Voice, when: str) -> None:
+def _require_stopped(stage: Stage, client: RawClient, when: str) -> None:
     began = stage.turns(client)
     refused = error_of(client.ask(stage.peer.arm, "turn", 0.1))
     require(isinstance(refused, errors.Stopped) and refused.estop, f"a turn {when} ended with {refused!r}")
@@ -178,7 +178,7 @@ def estop_learnt(stage: Stage) -> None:
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
-def _ordered(stage: Stage, client: Voice) -> EstopOrder:
+def _ordered(stage: Stage, client: RawClient) -> EstopOrder:
     """Opens an e-stop in the container under test and the suite's own."""
     order = _open(client)
     _order(stage, client, order)
@@ -190,6 +190,6 @@ def _ordered(stage: Stage, client: Voice) -> EstopOrder:
     return order
 
 
-def _with_voice(stage: Stage, does: Callable[[Voice], EstopOrder]) -> EstopOrder:
+def _with_voice(stage: Stage, does: Callable[[RawClient], EstopOrder]) -> EstopOrder:
     with stage.voice("bob") as bob:
         return does(bob)

@@ -11,22 +11,22 @@ from trade_checks.conformance._assertions import PATIENCE_S, NotHeld, eventually
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage
 from trade_checks.conformance._peer import GROUP
-from trade_checks.conformance._raw_client import SYSTEM, Voice, body_of, error_of
+from trade_checks.conformance._raw_client import SYSTEM, RawClient, body_of, error_of
 
 _ARM = ["peer.arm"]
 _LEASE_S = 1.0
 _MANY = 100
 
 
-def _renew(client: Voice, lock: Token) -> dict[int, str]:
+def _renew(client: RawClient, lock: Token) -> dict[int, str]:
     return dict(client.result(SYSTEM, "renew", [lock.number], stop=True))
 
 
-def _release(client: Voice, lock: Token, lost: str = "") -> bool:
+def _release(client: RawClient, lock: Token, lost: str = "") -> bool:
     return bool(client.result(SYSTEM, "release", lock.number, lost, stop=True))
 
 
-def _locks_of(client: Voice) -> list[LockInfo]:
+def _locks_of(client: RawClient) -> list[LockInfo]:
     try:
         return msgspec.convert(client.result(SYSTEM, "locks"), list[LockInfo])
     except msgspec.ValidationError as bad:
@@ -177,7 +177,7 @@ def stop_beside_waiting(stage: Stage) -> None:
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
-def _waiting(client: Voice) -> int:
+def _waiting(client: RawClient) -> int:
     return sum(len(info.waiting) for info in _locks_of(client))
 
 

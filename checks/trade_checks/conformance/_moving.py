@@ -5,7 +5,7 @@ from trade.protocol.messages import Status
 from trade_checks.conformance._assertions import require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage
-from trade_checks.conformance._raw_client import NEVER, SYSTEM, Voice, body_of, error_of
+from trade_checks.conformance._raw_client import NEVER, SYSTEM, RawClient, body_of, error_of
 
 
 @check("turns", "Writing a container in another language")
@@ -55,7 +55,7 @@ def stop_latches_own(stage: Stage) -> None:
         _latches(stage, anna, other, "a stop by another session of the same identity")
 
 
-def _latches(stage: Stage, anna: Voice, other: Voice, stop: str) -> None:
+def _latches(stage: Stage, anna: RawClient, other: RawClient, stop: str) -> None:
     arm, running = stage.peer.arm, stage.begin_turn(anna)
     try:
         with stage.stopping(anna, stop):

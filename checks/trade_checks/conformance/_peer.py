@@ -23,7 +23,7 @@ _GOODBYE_S: Final = 5.0
 _LOOK_S: Final = 0.02
 
 
-class Offer(Struct, frozen=True):
+class RegistryReply(Struct, frozen=True):
     """A container's answer to the registry query."""
 
     entries: dict[Place, ProviderInfo]
@@ -76,7 +76,7 @@ class Peer:
                 self._places.update((one.name, place) for one in info.services)
         return wanted in self._places
 
-    def offer(self) -> Offer:
+    def offer(self) -> RegistryReply:
         """Queries what it offers; raises NotHeld without an answer."""
         found = self._ask(registry_key("*", self.address, "*"))
         require(found, "it does not answer the registry query")
@@ -111,7 +111,7 @@ def end_group(process: "subprocess.Popen[bytes]") -> None:
     process.wait()
 
 
-def _offer(answer: Answer) -> Offer:
+def _offer(answer: Answer) -> RegistryReply:
     entries: dict[Place, ProviderInfo] = {}
     tally = -1
     for message in answer.messages:
@@ -124,4 +124,4 @@ def _offer(answer: Answer) -> Offer:
         except Malformed as bad:
             raise NotHeld(f"the entry of {domain}/{provider} cannot be read: {bad}") from None
     keys = tuple(message.key for message in answer.messages)
-    return Offer(entries, tally, keys[-1].rpartition("/")[2], keys)
+    return RegistryReply(entries, tally, keys[-1].rpartition("/")[2], keys)

@@ -8,7 +8,7 @@ from trade.protocol.messages import ServiceInfo, Tally, decode_tally
 from trade_checks.conformance._assertions import NotHeld, eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage
-from trade_checks.conformance._peer import GROUP, Offer
+from trade_checks.conformance._peer import GROUP, RegistryReply
 from trade_checks.conformance._raw_client import NEVER, SYSTEM
 
 ARM: Final = {
@@ -141,7 +141,7 @@ def leaves(stage: Stage) -> None:
     eventually(lambda: not stage.seen(peer.address), "its sign of life remains after its end")
 
 
-def _services(offer: Offer, place: tuple[str, str]) -> dict[str, ServiceInfo]:
+def _services(offer: RegistryReply, place: tuple[str, str]) -> dict[str, ServiceInfo]:
     entry = offer.entries.get(place)
     if entry is None:
         raise NotHeld(f"it has no provider {'/'.join(place)}")

@@ -37,7 +37,7 @@ PARTING_S: Final = 2.0
 """How long a reader may take to end. The end of the interpreter would abort one that is inside the transport."""
 
 
-class Voice:
+class RawClient:
     """A client with its own identity, whose session has a sign of life until it is closed."""
 
     def __init__(
@@ -51,7 +51,7 @@ class Voice:
         self.session: Final = f"{identity}/suite/{epoch}/{client}" if client else f"{identity}/suite/{epoch}"
         self._channel: Final = f"{epoch}.r"
         self._answers = transport.subscribe(reply_key("*", identity, "suite", self._channel))
-        self._heard: dict[int, list[Reply]] = {}
+        self._replies: dict[int, list[Reply]] = {}
         self._changed = threading.Condition()
         self.new_id: Final = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._publishers: dict[str, Publisher] = {}
@@ -136,7 +136,7 @@ class Voice:
     def answers(self, call_id: int) -> list[Reply]:
         """All answers to a call that have arrived."""
         with self._changed:
-            return [reply for reply in self._heard.get(call_id, ()) if reply.status != Status.PROGRESS]
+            return [reply for reply in self._replies.get(call_id, ()) if reply.status != Status.PROGRESS]
 
     def _read(self) -> None:
         while True:
@@ -150,7 +150,7 @@ class Voice:
                 continue
             if callee == self.callee.identity:
                 with self._changed:
-                    self._heard.setdefault(reply.id, []).append(reply)
+                    self._replies.setdefault(reply.id, []).append(reply)
 
     def close(self) -> None:
         """Ends its session. Idempotent."""
@@ -160,7 +160,7 @@ class Voice:
         for publisher in self._publishers.values():
             publisher.close()
 
-    def __enter__(self) -> "Voice":
+    def __enter__(self) -> "RawClient":
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError
 from trade_checks._cases import chosen
-from trade_checks.drill import SCENES, Played, Report, as_data, page, play, standing, targets_of
+from trade_checks.drill import SCENES, Report, SceneReport, as_data, page, play, standing, targets_of
 from trade_drivers import load, without
 from trade_gateway._usage import UsageError
 from trade_gateway.terminal import sections
@@ -62,7 +62,7 @@ def drill(
     impossible = {
         scene.name: "it concerns no device that moves here" for scene in scenes if not any(map(scene.concerns, targets))
     }
-    played: list[Played] = []
+    played: list[SceneReport] = []
     with tempfile.TemporaryDirectory(prefix="trade-drill-") as folder:
         out.say(f"[bold]{robot.name}[/]: moving {', '.join(target.name for target in targets)}, simulated")
         with standing(robot, targets, list(left_out), Path(folder)) as stand:
@@ -95,7 +95,7 @@ def _list(out: Output) -> None:
     out.table(("SCENE", "WHAT IS DONE", "SHOWS"), [(scene.name, scene.what, scene.shows) for scene in SCENES])
 
 
-def _print(out: Output, played: Played) -> None:
+def _print(out: Output, played: SceneReport) -> None:
     out.say(f"{played.scene}: {escape(played.what)}")
     for problem in played.problems:
         out.say(f"  [{_COLOURS[False]}]not held[/]: {escape(problem)}")

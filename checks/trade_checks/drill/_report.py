@@ -35,7 +35,7 @@ class Stop(Struct, frozen=True, kw_only=True):
         return float("inf") if self.took_s is None else self.took_s / self.limit_s
 
 
-class Played(Struct, frozen=True, kw_only=True):
+class SceneReport(Struct, frozen=True, kw_only=True):
     """The results of one scene."""
 
     scene: str
@@ -60,7 +60,7 @@ class Report(Struct, frozen=True, kw_only=True):
     host: str
     at: str
     """Date and time, ISO 8601."""
-    scenes: list[Played]
+    scenes: list[SceneReport]
     left_out: dict[str, str]
     """Parts of the robot and scenes that were skipped, and why."""
 
@@ -119,11 +119,11 @@ def page(report: Report) -> str:
     return "\n".join(part for part in parts if part) + "\n"
 
 
-def _severity(played: Played) -> tuple[bool, float]:
+def _severity(played: SceneReport) -> tuple[bool, float]:
     return played.ok, -max((stop.part for stop in played.stops), default=0.0)
 
 
-def _scene(played: Played) -> str:
+def _scene(played: SceneReport) -> str:
     colour, word = ("ok", "ok") if played.ok else ("bad", "failed")
     head = f'<h2>{escape(played.scene)} <small class="{colour}">{word}</small></h2>'
     what = f"<p>{escape(played.what)} (shows {escape(played.shows)} of docs/safety.md)</p>"

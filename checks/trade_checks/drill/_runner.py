@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from trade_checks.drill._report import Played, Stop
+from trade_checks.drill._report import SceneReport, Stop
 from trade_checks.drill._scenes import Scene, limit_s
 from trade_checks.drill._targets import Target
 from trade_checks.drill._testbed import Testbed
@@ -27,7 +27,7 @@ class DrillFailed(ChildFailed):
     """A drill cannot run: a process or device that it needs does not start, or does not move."""
 
 
-def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
+def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> SceneReport:
     """Runs a scene with the targets that it concerns.
 
     An attempt without a measurement is repeated, for example if a watchdog expires too early on a busy computer.
@@ -43,7 +43,7 @@ def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) 
             problems.append(str(problem))
         finally:
             stand.dismiss()
-    return Played(scene=scene.name, what=scene.what, shows=scene.shows, stops=stops, problems=problems)
+    return SceneReport(scene=scene.name, what=scene.what, shows=scene.shows, stops=stops, problems=problems)
 
 
 def _played(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> list[Stop]:

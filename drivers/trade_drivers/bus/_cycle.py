@@ -11,7 +11,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from trade import Resource
 from trade.errors import DeviceError, DeviceFault, DeviceSilent, TradeError
 from trade_drivers.bus._attempts import ATTEMPTS
-from trade_drivers.bus._jobs import Device, Work
+from trade_drivers.bus._jobs import AwaitedJob, Device
 from trade_robotfile import Bus
 
 PROBE_NS: Final = 500_000_000
@@ -27,7 +27,7 @@ def _lasting_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if sys.platform == "linux" else time.monotonic_ns()
 
 
-class Measured(Protocol):
+class Timestamped(Protocol):
     """One measurement."""
 
     @property
@@ -36,7 +36,7 @@ class Measured(Protocol):
         ...
 
 
-_Sample = TypeVar("_Sample", bound=Measured)
+_Sample = TypeVar("_Sample", bound=Timestamped)
 
 
 class BusDevice(ABC, Generic[_Sample]):
@@ -102,7 +102,7 @@ class BusDevice(ABC, Generic[_Sample]):
 _Device = TypeVar("_Device", bound=BusDevice[Any])
 
 
-class StopTicket(Work[_Device]):
+class StopTicket(AwaitedJob[_Device]):
     """A stop. It never expires, needs no permit, and ends when all its devices are at rest."""
 
     def __init__(self, devices: Sequence[_Device], halt: Callable[[], None]) -> None:
@@ -131,9 +131,9 @@ class BusCycle(ABC, Generic[_Device]):
         self.missed_answers = 0
         """Number since the start."""
         self._devices = tuple(devices)
-        self._inbox: deque[Work[_Device]] = deque()
+        self._inbox: deque[AwaitedJob[_Device]] = deque()
         self._stops: deque[StopTicket[_Device]] = deque()
-        self._working: list[Work[_Device]] = []
+        self._working: list[AwaitedJob[_Device]] = []
         self._stopping: list[StopTicket[_Device]] = []
 
     @abstractmethod
@@ -167,7 +167,7 @@ class BusCycle(ABC, Generic[_Device]):
 
     # --- from any thread
 
-    def submit(self, job: Work[_Device]) -> None:
+    def submit(self, job: AwaitedJob[_Device]) -> None:
         """Queues a job; its ``wait`` returns the outcome."""
         if self.refusing is not None:
             job.finish(self.refusing(job.devices[0]))

@@ -10,10 +10,10 @@ from typing import Any
 from trade.errors import TradeError
 from trade_drivers.bus._cycle import BusCycle, BusDevice
 from trade_drivers.bus._jobs import Device
-from trade_drivers.faults._trouble import Respect, Tell, Trouble, found_in
+from trade_drivers.faults._fault_update import FaultUpdate, Respect, Tell, found_in
 
 
-class _Seen:
+class _ReportedState:
     """The last reported state of one device."""
 
     __slots__ = ("device", "fault", "link", "refusing")
@@ -31,13 +31,13 @@ class FaultDetector:
     def __init__(self, exchange: BusCycle[Any], tell: Tell) -> None:
         self._exchange = exchange
         self._tell = tell
-        self._seen = tuple(_Seen(device) for device in exchange.devices)
+        self._reported_states = tuple(_ReportedState(device) for device in exchange.devices)
 
     def look(self) -> None:
         """Compares each device with its last reported state."""
         exchange = self._exchange
         now_ns, refusing, stale_ns = exchange.clock(), exchange.refusing, exchange.stale_after_ns
-        for seen in self._seen:
+        for seen in self._reported_states:
             device = seen.device
             if (fault := device.fault) != seen.fault:
                 seen.fault = fault
@@ -52,4 +52,4 @@ class FaultDetector:
 
     def _say(self, device: BusDevice[Any], respect: Respect, error: TradeError | None) -> None:
         found = () if error is None else found_in(device.name, error)
-        self._tell(Trouble(device.name, respect, time.time(), time.monotonic(), found))
+        self._tell(FaultUpdate(device.name, respect, time.time(), time.monotonic(), found))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from trade import Permit, Resource, current_call, permit
 from trade.errors import DeadlineExceeded
-from trade_drivers.bus._jobs import DeviceT_co, Work
+from trade_drivers.bus._jobs import AwaitedJob, DeviceT_co
 
 if TYPE_CHECKING:
     from trade_drivers.bus._cycle import BusCycle
@@ -66,7 +66,7 @@ def span(clock: Callable[[], int]) -> tuple[int, int | None]:
     return expires_ns, expires_ns
 
 
-class Command(Work[DeviceT_co], Generic[DeviceT_co, _Cycle_co]):
+class Command(AwaitedJob[DeviceT_co], Generic[DeviceT_co, _Cycle_co]):
     """A command that may start motion. It expires, and its call was admitted under a permit."""
 
     def __init__(self, exchange: _Cycle_co, devices: Sequence[DeviceT_co], terms: Terms) -> None:

@@ -67,7 +67,7 @@ class BadAnswer(NoAnswer):
     """The answer was damaged or incomplete."""
 
 
-class Refused(WireError):
+class RequestRefused(WireError):
     """The device refused the request, with a reason."""
 
     def __init__(self, device_id: int, reason: str) -> None:
@@ -91,7 +91,7 @@ class Device(Protocol):
 DeviceT_co = TypeVar("DeviceT_co", bound=Device, covariant=True)
 
 
-class Work(Generic[DeviceT_co]):
+class AwaitedJob(Generic[DeviceT_co]):
     """A job with a waiting service. The base class needs no permit: it is for jobs that end motion."""
 
     def __init__(self, devices: Sequence[DeviceT_co]) -> None:

@@ -228,8 +228,8 @@ class SerialWire:
         self.settled_at = time.monotonic() + drain_s
 
 
-def _lost(why: str) -> PortLost:
-    return PortLost(f"{why}; plug its adapter in again")
+def _lost(reason: str) -> PortLost:
+    return PortLost(f"{reason}; plug its adapter in again")
 
 
 def _text(bad: Exception) -> str:

@@ -18,7 +18,7 @@ Into = Callable[[Any], Sequence[Any]]
 OutOf = Callable[[Any], Any]
 
 
-class _Back(NamedTuple):
+class _OutParameter(NamedTuple):
     """A result that C writes through a pointer."""
 
     type: str
@@ -32,7 +32,7 @@ class Passing(NamedTuple):
 
     ffi: Any
     into_c: Sequence[Into]
-    backs: Sequence[_Back]
+    backs: Sequence[_OutParameter]
     returned: OutOf | None
     """Converts the return value; None if it is not the result."""
     has_status: bool
@@ -58,7 +58,7 @@ class Passing(NamedTuple):
 def plan(
     ffi: Any,
     where: str,
-    kind: Any,
+    type_: Any,
     hints: Mapping[str, Any],
     *,
     status: bool | None,
@@ -66,18 +66,18 @@ def plan(
     lengths: Sequence[int],
 ) -> Passing:
     """See `CLibrary.function`; the hints are the method's, with its result. Raises ConfigurationError."""
-    planned = _Planning(ffi, where, list(kind.args)[handle:], list(lengths))
+    planned = _Planning(ffi, where, list(type_.args)[handle:], list(lengths))
     for name, hint in hints.items():
         if name != "return":
             planned.take(name, hint)
     result = hints["return"]
-    returns_more = kind.result.kind != "void" and (bool(planned.kinds) or result is _NONE)
+    returns_more = type_.result.kind != "void" and (bool(planned.kinds) or result is _NONE)
     has_status = returns_more if status is None else status
-    if has_status and _python(kind.result) not in (int, bool):
+    if has_status and _python(type_.result) not in (int, bool):
         remedy = "; status=False throws it away" if status is None else ""
-        raise planned.wrong(f"it returns {kind.result.cname}, which is no status{remedy}")
+        raise planned.wrong(f"it returns {type_.result.cname}, which is no status{remedy}")
     by_value = not planned.kinds and result is not _NONE
-    returned = planned.reads(kind.result, result, "its result") if by_value else None
+    returned = planned.reads(type_.result, result, "its result") if by_value else None
     return Passing(ffi, planned.into_c, [] if by_value else planned.give_back(result), returned, has_status)
 
 
@@ -108,19 +108,19 @@ class _Planning:
             raise self.wrong(f"{name} is {_named(hint)}, the function takes {kind.cname}{counted}")
         self.into_c.append(put)
 
-    def _one(self, kind: Any, hint: Any, name: str) -> Into | None:
-        if hint is str and kind.cname in _TEXTS:
+    def _one(self, type_: Any, hint: Any, name: str) -> Into | None:
+        if hint is str and type_.cname in _TEXTS:
             return lambda value: (self._ffi.new("char[]", _text(value)),)
-        if kind.cname == "float" and hint is float:
+        if type_.cname == "float" and hint is float:
             return lambda value: (_fits(value, self._ffi.cast("float", value)),)
-        if hint in (_python(kind), *((bool,) if _python(kind) is int else ())):
+        if hint in (_python(type_), *((bool,) if _python(type_) is int else ())):
             return lambda value: (value,)
-        if kind.kind != "struct" or not is_dataclass(hint):
+        if type_.kind != "struct" or not is_dataclass(hint):
             return None
-        self._struct(kind, hint, name)
-        members, made = [field.name for field in fields(hint)], f"{kind.cname} *"
-        if missing := [one for one, _ in kind.fields or () if one not in members]:
-            raise self.wrong(f"{_named(hint)} has no {', '.join(missing)}, which {kind.cname} has")
+        self._struct(type_, hint, name)
+        members, made = [field.name for field in fields(hint)], f"{type_.cname} *"
+        if missing := [one for one, _ in type_.fields or () if one not in members]:
+            raise self.wrong(f"{_named(hint)} has no {', '.join(missing)}, which {type_.cname} has")
 
         def put(value: Any) -> Sequence[Any]:
             given = {one: getattr(value, one) for one in members}
@@ -131,11 +131,11 @@ class _Planning:
 
         return put
 
-    def _several(self, kind: Any, hint: Any) -> Into | None:
-        if kind.kind != "pointer" or not self._is_count() or get_args(hint) != (_python(kind.item),):
+    def _several(self, type_: Any, hint: Any) -> Into | None:
+        if type_.kind != "pointer" or not self._is_count() or get_args(hint) != (_python(type_.item),):
             return None
         self.kinds.pop(0)
-        made = f"{kind.item.cname}[]"
+        made = f"{type_.item.cname}[]"
 
         def put(values: Sequence[Any]) -> Sequence[Any]:
             array = self._ffi.new(made, list(values))
@@ -150,9 +150,9 @@ class _Planning:
 
     # --- results
 
-    def give_back(self, result: Any) -> list[_Back]:
+    def give_back(self, result: Any) -> list[_OutParameter]:
         """Matches all remaining parameters with the method's result."""
-        backs: list[_Back] = []
+        backs: list[_OutParameter] = []
         several = get_origin(result) is tuple
         wanted = [*get_args(result)] if several else [] if result is _NONE else [result]
         while self.kinds:
@@ -163,19 +163,19 @@ class _Planning:
             raise self.wrong(f"the function gives {len(backs)} values back, the method returns {_named(result)}")
         return backs
 
-    def _back(self, kind: Any, hint: Any) -> _Back:
-        if kind.kind != "pointer" or kind.item.kind not in ("primitive", "enum", "struct"):
-            raise self.wrong(f"nothing is given for its parameter {kind.cname}, and nothing can come back by that")
+    def _back(self, type_: Any, hint: Any) -> _OutParameter:
+        if type_.kind != "pointer" or type_.item.kind not in ("primitive", "enum", "struct"):
+            raise self.wrong(f"nothing is given for its parameter {type_.cname}, and nothing can come back by that")
         if get_origin(hint) is not list:
-            read = self.reads(kind.item, hint, "what comes back")
+            read = self.reads(type_.item, hint, "what comes back")
 
             def first(place: Any) -> Any:
                 return read(place[0])
 
-            return _Back(f"{kind.item.cname} *", 0, first)
+            return _OutParameter(f"{type_.item.cname} *", 0, first)
         if not self._lengths:
-            raise self.wrong(f"say by out=... how many come back by its parameter {kind.cname}")
-        length, read = self._lengths.pop(0), self.reads(kind.item, get_args(hint)[0], "what comes back")
+            raise self.wrong(f"say by out=... how many come back by its parameter {type_.cname}")
+        length, read = self._lengths.pop(0), self.reads(type_.item, get_args(hint)[0], "what comes back")
         counted = self._is_count()
         if counted:
             self.kinds.pop(0)
@@ -183,42 +183,42 @@ class _Planning:
         def each(place: Any) -> list[Any]:
             return [read(one) for one in place]
 
-        return _Back(f"{kind.item.cname}[{length}]", length if counted else 0, each)
+        return _OutParameter(f"{type_.item.cname}[{length}]", length if counted else 0, each)
 
-    def reads(self, kind: Any, hint: Any, what: str) -> OutOf:
+    def reads(self, type_: Any, hint: Any, what: str) -> OutOf:
         """Returns the conversion of a C value to Python."""
-        if hint is str and kind.cname in _TEXTS:
+        if hint is str and type_.cname in _TEXTS:
             return lambda value: "" if value == self._ffi.NULL else self._ffi.string(value).decode(errors="replace")
-        if kind.kind == "struct" and is_dataclass(hint):
-            return self._struct(kind, hint, what)
-        if hint is bool and _python(kind) in (int, bool):
+        if type_.kind == "struct" and is_dataclass(hint):
+            return self._struct(type_, hint, what)
+        if hint is bool and _python(type_) in (int, bool):
             return bool
-        if _python(kind) is hint:
+        if _python(type_) is hint:
             return _itself
-        raise self.wrong(f"{what} is {kind.cname}, which cannot be {_named(hint)}")
+        raise self.wrong(f"{what} is {type_.cname}, which cannot be {_named(hint)}")
 
-    def _struct(self, kind: Any, hint: Any, what: str) -> OutOf:
-        has, wanted = dict(kind.fields or ()), get_type_hints(hint)
+    def _struct(self, type_: Any, hint: Any, what: str) -> OutOf:
+        has, wanted = dict(type_.fields or ()), get_type_hints(hint)
         if missing := wanted.keys() - has.keys():
-            raise self.wrong(f"{kind.cname} has no {', '.join(sorted(missing))}, which {_named(hint)} has")
+            raise self.wrong(f"{type_.cname} has no {', '.join(sorted(missing))}, which {_named(hint)} has")
         reads = {name: self.reads(has[name].type, one, f"{what}.{name}") for name, one in wanted.items()}
         return lambda value: hint(**{name: read(getattr(value, name)) for name, read in reads.items()})
 
 
-def _python(kind: Any) -> type | None:
+def _python(type_: Any) -> type | None:
     """Returns the Python type of a C number."""
-    if kind.kind == "enum":
+    if type_.kind == "enum":
         return int
-    if kind.kind != "primitive" or kind.cname in ("char", "wchar_t"):
+    if type_.kind != "primitive" or type_.cname in ("char", "wchar_t"):
         return None
-    return bool if kind.cname == "_Bool" else float if kind.cname in _FLOATS else int
+    return bool if type_.cname == "_Bool" else float if type_.cname in _FLOATS else int
 
 
-def is_never_negative(kind: Any) -> bool:
+def is_never_negative(type_: Any) -> bool:
     """Returns whether a C number type has no values below zero, so that none can mean failure."""
-    if kind.kind == "enum":
-        return min(kind.elements, default=0) >= 0
-    return kind.cname.startswith(("uint", "unsigned")) or kind.cname == "size_t"
+    if type_.kind == "enum":
+        return min(type_.elements, default=0) >= 0
+    return type_.cname.startswith(("uint", "unsigned")) or type_.cname == "size_t"
 
 
 def _fits(value: Any, held: Any) -> Any:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, ClassVar, Final, NoReturn, TypeVar
 
 from trade.errors import ConfigurationError
-from trade_drivers.commissioning._commissioner import Bench, Found
+from trade_drivers.commissioning._commissioner import Bench, ScannedDevice
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort, Frame, Talk
+    from trade_drivers.bus.can import CanPort, Frame, FramesById
 
 _LISTEN_S: Final = 1.0
 """How long to listen for other drivers, and for devices that report by themselves."""
@@ -29,7 +29,7 @@ class CanBench(Bench):
     """How to set the zero of its devices."""
 
     def __init__(self, port: "CanPort", bitrate: int) -> None:
-        self._port, self._bitrate, self._talk = port, bitrate, port.talk
+        self._port, self._bitrate, self._sniffed = port, bitrate, port.sniffed
 
     @classmethod
     def open(cls: type[_Self], port: str, bitrate: int) -> _Self:
@@ -55,12 +55,12 @@ class CanBench(Bench):
 
     @staticmethod
     @abstractmethod
-    def orders(talk: "Talk") -> Collection[int]:
+    def orders(sniffed: "FramesById") -> Collection[int]:
         """Returns the identifiers among the frames that only a driver of such devices sends."""
 
     def refuse(self) -> None:
         """Raises ``ConfigurationError`` if there are ODrives, which would take requests to others for commands."""
-        if nodes := self._talk.odrives:
+        if nodes := self._sniffed.odrives:
             numbers = ", ".join(map(str, sorted(nodes)))
             problem = f"ODrives talk on this bus (node {numbers}) and would take its requests for commands"
             raise ConfigurationError(where=f"driver {self.driver}", problem=problem)
@@ -100,9 +100,9 @@ class CanBench(Bench):
         counts_per_rev: float | None = None,
         torque: bool | None = None,
         problem: str = "",
-    ) -> Found:
+    ) -> ScannedDevice:
         """Returns a record of a device on this bus."""
-        return Found(
+        return ScannedDevice(
             driver=self.driver,
             wire="can",
             baud=self._bitrate,

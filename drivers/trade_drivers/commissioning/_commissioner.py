@@ -16,7 +16,7 @@ from trade_drivers.bus._jobs import PortLost, WireError
 _ATTEMPTS: Final = 3
 
 
-class Found(Struct, frozen=True, kw_only=True):
+class ScannedDevice(Struct, frozen=True, kw_only=True):
     """A device that answers a scan."""
 
     driver: str
@@ -50,10 +50,10 @@ class Bench(ABC):
         """Returns False if no device can be on the line, so that no id needs to be tried."""
 
     @abstractmethod
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         """Returns the device that answers to an id, or None."""
 
-    def alone(self, device_id: int, where: str) -> Found:
+    def alone(self, device_id: int, where: str) -> ScannedDevice:
         """Returns the device with an id if it is safe to write to it or to turn it by hand.
 
         Raises:
@@ -70,7 +70,7 @@ class Bench(ABC):
             raise ConfigurationError(where=where, problem=problem)
         return found
 
-    def answering(self, device_id: int) -> Found | None:
+    def answering(self, device_id: int) -> ScannedDevice | None:
         """Returns the device that answers to an id within three attempts, or None."""
         return next((found for _ in range(_ATTEMPTS) if (found := self.look(device_id)) is not None), None)
 
@@ -152,7 +152,7 @@ class Commissioner(ABC):
         except PortLost as lost:
             raise ConfigurationError(where=port, problem=f"{lost}; {self.ports}") from None
 
-    def set_id(self, port: str, baud: int, device_id: int, to: int) -> Found:
+    def set_id(self, port: str, baud: int, device_id: int, to: int) -> ScannedDevice:
         """Changes the id of a device permanently.
 
         Returns:
@@ -180,7 +180,7 @@ class Commissioner(ABC):
                     bench.seal(one.id)
         return _changed(before, now, stayed, where, f"id {to}")
 
-    def set_baud(self, port: str, baud: int, device_id: int, to: int) -> Found:
+    def set_baud(self, port: str, baud: int, device_id: int, to: int) -> ScannedDevice:
         """Changes the baud rate of a device permanently.
 
         Returns:
@@ -226,7 +226,7 @@ def scan(
     bauds: Sequence[int] = (),
     ids: Collection[int] = (),
     progress: Callable[[int, int], None] = lambda _baud, _found: None,
-) -> list[Found]:
+) -> list[ScannedDevice]:
     """Finds the devices on a line. Writes nothing. Calls back after each rate, with it and the number of devices found.
 
     Args:
@@ -238,7 +238,7 @@ def scan(
     Raises:
         ConfigurationError: the port cannot be opened, or a device has torque on: a scan would delay its stop.
     """
-    found: list[Found] = []
+    found: list[ScannedDevice] = []
     for baud in bauds or commissioner.bauds:
         with commissioner.at(port, baud) as bench:
             if ids:
@@ -250,7 +250,7 @@ def scan(
     return found
 
 
-def _safe(answers: Iterable[Found | None], port: str) -> Iterator[Found]:
+def _safe(answers: Iterable[ScannedDevice | None], port: str) -> Iterator[ScannedDevice]:
     for found in answers:
         if found is None:
             continue
@@ -263,7 +263,9 @@ def _safe(answers: Iterable[Found | None], port: str) -> Iterator[Found]:
         yield found
 
 
-def _changed(before: Found, now: Found | None, stayed: Found | None, where: str, what: str) -> Found:
+def _changed(
+    before: ScannedDevice, now: ScannedDevice | None, stayed: ScannedDevice | None, where: str, what: str
+) -> ScannedDevice:
     """Returns the changed device, if it alone has changed."""
     if stayed is not None and now is None:
         raise ConfigurationError(where=where, problem=f"it did not accept {what}, and answers as before")

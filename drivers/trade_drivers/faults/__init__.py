@@ -1,10 +1,10 @@
 """Faults of a robot's devices: detected by bus threads, kept in one log, exposed as services."""
 
 from trade_drivers.faults._fault_poller import FaultPoller
+from trade_drivers.faults._fault_update import FaultUpdate, Tell
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Fault, FaultInfo, FaultSample
 from trade_drivers.faults._store import FaultStore
-from trade_drivers.faults._trouble import Tell, Trouble
 
 __all__ = [
     "Fault",
@@ -13,6 +13,6 @@ __all__ = [
     "FaultPoller",
     "FaultSample",
     "FaultStore",
+    "FaultUpdate",
     "Tell",
-    "Trouble",
 ]

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 from trade.errors import DeviceFault, TradeError
 from trade.protocol.messages import HEALTHY
+from trade_drivers.faults._fault_update import DetectedFault, FaultUpdate, found_in
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Moment, when
-from trade_drivers.faults._trouble import Found, Trouble, found_in
 from trade_drivers.interfaces._arm import Arm, ArmState
 from trade_drivers.interfaces._motion import Gripper, Motor
 from trade_drivers.interfaces._sensing import Sensor
@@ -22,7 +22,7 @@ _HEALTH_EVERY_S: Final = 0.5
 _KEPT: Final = 50
 """Number of measurements kept for each device: two seconds of them."""
 _END_S: Final = 5.0
-_END: Final = Trouble("", "fault", 0.0, 0.0)
+_END: Final = FaultUpdate("", "fault", 0.0, 0.0)
 """The last item of the queue."""
 _MEASURING: Final = (Motor, Gripper, Arm, Sensor)
 
@@ -49,17 +49,17 @@ class FaultPoller:
         self._healths: Mapping[object, Sequence[Health]] = {}
         self._reported: dict[object, str] = {}
         """The health of each provider that was reported last."""
-        self._queue: queue.SimpleQueue[Trouble] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[FaultUpdate] = queue.SimpleQueue()
         self._devices: dict[str, Any] = {}
         self._asked: frozenset[str] = frozenset()
         self._lately: dict[str, deque[Moment]] = {}
-        self._known: dict[tuple[str, str], dict[str, Found]] = {}
+        self._known: dict[tuple[str, str], dict[str, DetectedFault]] = {}
         """Current faults by device and respect."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def tell(self, trouble: Trouble) -> None:
+    def tell(self, update: FaultUpdate) -> None:
         """Queues a detected change; never waits."""
-        self._queue.put(trouble)
+        self._queue.put(update)
 
     def start(
         self, devices: Mapping[str, object], asked: Collection[str], healths: Mapping[object, Sequence[Health]] = {}
@@ -88,9 +88,9 @@ class FaultPoller:
 
     def _run(self) -> None:
         due_s = health_due_s = time.monotonic()
-        while (trouble := self._next(due_s)) is not _END:
-            if trouble is not None:
-                self._take(trouble)
+        while (update := self._next(due_s)) is not _END:
+            if update is not None:
+                self._take(update)
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + _EVERY_S
                 self._look_at_all()
@@ -99,7 +99,7 @@ class FaultPoller:
                 health_due_s = time.monotonic() + _HEALTH_EVERY_S
                 self._report_health()
 
-    def _next(self, due_s: float) -> Trouble | None:
+    def _next(self, due_s: float) -> FaultUpdate | None:
         try:
             return self._queue.get(timeout=max(0.0, due_s - time.monotonic()))
         except queue.Empty:
@@ -109,7 +109,7 @@ class FaultPoller:
         for name in self._devices:
             found = self._measure(name)
             if name in self._asked:
-                self._take(Trouble(name, "fault", time.time(), time.monotonic(), found))
+                self._take(FaultUpdate(name, "fault", time.time(), time.monotonic(), found))
 
     def _report_health(self) -> None:
         for provider, judges in self._healths.items():
@@ -119,7 +119,7 @@ class FaultPoller:
                     self._set_health(provider, health)
                     self._reported[provider] = health
 
-    def _measure(self, name: str) -> tuple[Found, ...]:
+    def _measure(self, name: str) -> tuple[DetectedFault, ...]:
         """Keeps a device's measurement if it is new, and returns the faults that the device itself reports."""
         device, lately = self._devices[name], self._lately[name]
         try:
@@ -132,16 +132,16 @@ class FaultPoller:
         remedy = state.remedy if isinstance(state, ArmState) else "remove the cause, then enable it again"
         return found_in(name, DeviceFault(device=name, bus="", fault=fault, remedy=remedy)) if fault else ()
 
-    def _take(self, trouble: Trouble) -> None:
-        device = trouble.device
-        before = self._known.get((device, trouble.respect), {})
-        now = {found.kind: found for found in trouble.found}
-        self._known[device, trouble.respect] = now
+    def _take(self, update: FaultUpdate) -> None:
+        device = update.device
+        before = self._known.get((device, update.respect), {})
+        now = {found.kind: found for found in update.found}
+        self._known[device, update.respect] = now
         for kind in before:
             if kind not in now:
-                self._log.end(device, kind, trouble.at, trouble.at_s)
+                self._log.end(device, kind, update.at, update.at_s)
         begun = [found for kind, found in now.items() if kind not in before]
         if begun and device in self._devices:
             self._measure(device)
         for found in begun:
-            self._log.begin(device, found, trouble.at, trouble.at_s, tuple(self._lately.get(device, ())))
+            self._log.begin(device, found, update.at, update.at_s, tuple(self._lately.get(device, ())))

@@ -12,9 +12,9 @@ from msgspec import Struct, structs
 
 from trade import Meta, current_call, service
 from trade.errors import InvalidArgument
+from trade_drivers.faults._fault_update import DetectedFault
 from trade_drivers.faults._record import Fault, FaultInfo, Moment, info_of, samples_of
 from trade_drivers.faults._store import FaultStore, Kept, Key
-from trade_drivers.faults._trouble import Found
 
 _logger = logging.getLogger("trade")
 
@@ -143,7 +143,7 @@ class FaultLog:
 
     # --- for fault detectors
 
-    def begin(self, device: str, found: Found, at: float, at_s: float, moments: Sequence[Moment] = ()) -> None:
+    def begin(self, device: str, found: DetectedFault, at: float, at_s: float, moments: Sequence[Moment] = ()) -> None:
         """Records the beginning of a fault.
 
         Args:
@@ -202,7 +202,7 @@ class FaultLog:
 
     # --- under the lock
 
-    def _add(self, key: Key, found: Found, at: float, at_s: float, moments: Sequence[Moment]) -> None:
+    def _add(self, key: Key, found: DetectedFault, at: float, at_s: float, moments: Sequence[Moment]) -> None:
         samples = samples_of(moments, at_s)
         fault = Fault(
             id=self._new_id(),
@@ -231,7 +231,9 @@ class FaultLog:
         self._reported.pop(key, None)
         self._unsaved.add(key)
 
-    def _begin_again(self, entry: _Entry, found: Found, at: float, at_s: float, moments: Sequence[Moment]) -> None:
+    def _begin_again(
+        self, entry: _Entry, found: DetectedFault, at: float, at_s: float, moments: Sequence[Moment]
+    ) -> None:
         self._number += 1
         entry.number, entry.began_s, entry.moments = self._number, at_s, tuple(moments)
         self._change(

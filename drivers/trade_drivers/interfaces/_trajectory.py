@@ -10,8 +10,8 @@ from trade import current_call
 from trade.errors import InvalidArgument, LimitExceeded
 from trade_drivers._validation import finite, one_each
 from trade_drivers.motion._plan import Course, JointLimits, Plan, Tolerances, Track
-from trade_drivers.motion._ramps import Passage
-from trade_drivers.motion._spline import Curve, Piece, cubic
+from trade_drivers.motion._ramps import RampSegment
+from trade_drivers.motion._spline import CubicSegment, Curve, cubic
 
 _ROUNDING = 1e-6
 _AT_ONCE_S = 1e-3
@@ -94,7 +94,7 @@ def _curve(
     _keep(limits.name, "angle", "rad", list(zip(times_s, angles_rad, strict=True)), low, high)
     _keep(limits.name, "speed", "rad/s", list(zip(times_s, speeds_rad_s, strict=True)), -speed, speed)
     speed = max(speed, *map(abs, speeds_rad_s))  # they exceed it by no more than rounding
-    pieces: list[Piece] = []
+    pieces: list[CubicSegment] = []
     for (begins_s, start, before), (ends_s, end, after) in pairwise(
         zip(times_s, angles_rad, speeds_rad_s, strict=True)
     ):
@@ -102,7 +102,7 @@ def _curve(
         if _keeps(limits, piece, angles_rad[0]):
             pieces.append(piece)
             continue
-        passage = Passage(begins_s, ends_s - begins_s, start, end, before, after)
+        passage = RampSegment(begins_s, ends_s - begins_s, start, end, before, after)
         if (ramped := passage.ramped(speed, accel)) is None:
             if abs(mean := passage.mean_rad_s) > speed:
                 raise _beyond(limits.name, "speed", "rad/s", begins_s, mean, -speed, speed)
@@ -112,7 +112,7 @@ def _curve(
     return Curve(pieces)
 
 
-def _keeps(limits: JointLimits, piece: Piece, start_rad: float) -> bool:
+def _keeps(limits: JointLimits, piece: CubicSegment, start_rad: float) -> bool:
     try:
         _within(limits, [piece], start_rad)
     except LimitExceeded:
@@ -135,7 +135,7 @@ def checked(tracks: Sequence[Track], tolerances: Tolerances) -> Plan:
     return Plan(tracks, tolerances, Course([limits.name for limits, _ in tracks], tracks[0].curve.duration_s))
 
 
-def _within(limits: JointLimits, pieces: Sequence[Piece], start_rad: float) -> None:
+def _within(limits: JointLimits, pieces: Sequence[CubicSegment], start_rad: float) -> None:
     """Raises ``LimitExceeded`` if pieces exceed a limit; the range includes the start of the motion."""
     low, high = _range(limits, start_rad)
     speed, accel = limits.max_speed_rad_s, limits.max_accel_rad_s2

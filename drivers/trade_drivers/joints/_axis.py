@@ -11,7 +11,7 @@ from msgspec import Struct
 from trade import Permit, Resource
 from trade.errors import DeviceFault, LimitExceeded
 from trade_drivers.bus._cycle import BusDevice
-from trade_drivers.bus._jobs import Work
+from trade_drivers.bus._jobs import AwaitedJob
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints._zero import Zero
 from trade_robotfile import Joint
@@ -268,7 +268,7 @@ class Axis(BusDevice[Sample]):
         )
 
 
-class AxisMotion(Work[AxisT]):
+class AxisMotion(AwaitedJob[AxisT]):
     """A motion of one or more joints, as far as a joint knows it."""
 
     permit: Permit

@@ -9,7 +9,7 @@ from trade.errors import DeviceSilent, MotionStopped, TradeError
 from trade_drivers.bus._angle_store import Span
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._gate import Command
-from trade_drivers.bus._jobs import Device, Gate, Steps, Work
+from trade_drivers.bus._jobs import AwaitedJob, Device, Gate, Steps
 from trade_drivers.joints._axis import AxisMotion, AxisT, Goal
 from trade_robotfile import Bus
 
@@ -66,11 +66,11 @@ class Exchange(BusCycle[AxisT]):
         """Makes joints brake at their maximum deceleration and hold near these positions. Never waits."""
 
     @abstractmethod
-    def enabling(self, job: Work[AxisT], axis: AxisT) -> Steps:
+    def enabling(self, job: AwaitedJob[AxisT], axis: AxisT) -> Steps:
         """Arms the watchdog and switches torque on at the measured position, reads both back, and sets ``ready``."""
 
     @abstractmethod
-    def relaxing(self, job: Work[AxisT], axis: AxisT) -> Steps:
+    def relaxing(self, job: AwaitedJob[AxisT], axis: AxisT) -> Steps:
         """Switches torque off and disarms the watchdog."""
 
     @abstractmethod
@@ -82,7 +82,7 @@ class Exchange(BusCycle[AxisT]):
         yield from ()
 
     @abstractmethod
-    def leaving(self, job: Work[AxisT], axis: AxisT, *, relax: bool) -> Steps:
+    def leaving(self, job: AwaitedJob[AxisT], axis: AxisT, *, relax: bool) -> Steps:
         """Switches torque off or leaves it on, and disarms the watchdog where that is allowed."""
 
     # --- from any thread
@@ -256,7 +256,7 @@ class Motion(AxisMotion[AxisT], Command[AxisT, Exchange[AxisT]]):
         """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
 
 
-class Leave(Work[AxisT]):
+class Leave(AwaitedJob[AxisT]):
     """The shutdown of the driver after all joints were stopped: hold or relax, as the robot file says.
 
     The watchdog of a holding joint is disarmed after the joint was seen at rest, since the driver's silence is then

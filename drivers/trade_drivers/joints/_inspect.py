@@ -10,7 +10,7 @@ from trade_robotfile import Bus
 _BRAKING_S: Final = 1.5
 
 
-class Unfit(Exception):
+class DeviceUnusable(Exception):
     """A joint's device cannot be used as it is; has the reason and the key of the joint."""
 
     def __init__(self, problem: str, key: str = "") -> None:
@@ -28,7 +28,7 @@ def check_joints(axes: Iterable[AxisT], where: str, check: Callable[[AxisT], Non
         try:
             check(axis)
             _check_braking(axis)
-        except Unfit as bad:
+        except DeviceUnusable as bad:
             raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"{bad.key}', problem=str(bad)) from None
 
 
@@ -36,17 +36,17 @@ def _check_braking(axis: Axis) -> None:
     braking_s = axis.joint.max_speed_rad_s / axis.joint.max_accel_rad_s2
     if braking_s > _BRAKING_S:
         problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
-        raise Unfit(problem, ".max_accel_rad_s2")
+        raise DeviceUnusable(problem, ".max_accel_rad_s2")
 
 
 def check_least(axis: Axis, least: str) -> None:
-    """Raises ``Unfit`` for limits below the device's resolution; ``least`` describes it."""
+    """Raises ``DeviceUnusable`` for limits below the device's resolution; ``least`` describes it."""
     for key, value, count in (
         (".max_speed_rad_s", axis.joint.max_speed_rad_s, axis.resolution.rad_s),
         (".max_accel_rad_s2", axis.joint.max_accel_rad_s2, axis.resolution.rad_s2),
     ):
         if value < count:
-            raise Unfit(f"{value:.3g} is below {count:.3g}, {least}", key)
+            raise DeviceUnusable(f"{value:.3g} is below {count:.3g}, {least}", key)
 
 
 def check_rate(bus: Bus, where: str, times: int) -> None:

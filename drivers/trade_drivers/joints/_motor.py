@@ -44,9 +44,9 @@ class _Joints(Generic[AxisT, _Exchange]):
     def relax(self) -> None:
         self._do(Relax, "relax")
 
-    def _do(self, kind: type[Enable[AxisT] | Relax[AxisT] | Halt[AxisT]], name: str) -> None:
+    def _do(self, job_type: type[Enable[AxisT] | Relax[AxisT] | Halt[AxisT]], name: str) -> None:
         with admitted(f"{self._name}.{name}", self.resources, at_once(self._exchange.clock)) as terms:
-            self._finish(kind(self._exchange, self._axes, terms))
+            self._finish(job_type(self._exchange, self._axes, terms))
 
     def _finish(self, job: Command[AxisT, Any]) -> None:
         self._exchange.submit(job)

@@ -15,7 +15,7 @@ from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.interfaces._motion import JointGroup, MotorState
 from trade_drivers.interfaces._trajectory import checked
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances, Track
-from trade_drivers.motion._spline import Way, there_together
+from trade_drivers.motion._spline import JointTask, there_together
 
 _Result = TypeVar("_Result")
 _LEAST_RAD_S: Final = 1e-3
@@ -62,7 +62,9 @@ class AcrossGroup(JointGroup):
                 within(most, _LEAST_RAD_S, limit.max_speed_rad_s, f"{limit.name} speed", "rad/s") for limit in limits
             ]
         ways = [
-            Way(state.position_rad, state.velocity_rad_s if state.moving else 0.0, goal, speed, limit.max_accel_rad_s2)
+            JointTask(
+                state.position_rad, state.velocity_rad_s if state.moving else 0.0, goal, speed, limit.max_accel_rad_s2
+            )
             for state, goal, speed, limit in zip(self.state(), goals, speeds, limits, strict=True)
         ]
         curves = there_together(ways)

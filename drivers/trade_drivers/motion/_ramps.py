@@ -3,7 +3,7 @@
 from math import copysign, sqrt
 from typing import Final, NamedTuple
 
-from trade_drivers.motion._spline import Piece
+from trade_drivers.motion._spline import CubicSegment
 
 _OFF_RAD: Final = 1e-6
 """The deviation from a point that counts as rounding: no joint resolves it."""
@@ -12,7 +12,7 @@ _OFF_RAD_S: Final = 2e-6
 _DOUBLINGS: Final = 64
 
 
-class Passage(NamedTuple):
+class RampSegment(NamedTuple):
     """The task between two points: from one angle and speed to another, in a given time.
 
     Among all motions within the limits, the one with ramps at the full acceleration around a cruise leaves the range
@@ -31,7 +31,7 @@ class Passage(NamedTuple):
         """The speed that it needs on average."""
         return (self.end_rad - self.start_rad) / self.duration_s
 
-    def ramped(self, speed_rad_s: float, accel_rad_s2: float) -> list[Piece] | None:
+    def ramped(self, speed_rad_s: float, accel_rad_s2: float) -> list[CubicSegment] | None:
         """Returns its motion within these limits, which must include the speeds at both points; None: there is none."""
         most = accel_rad_s2 * self.duration_s
         before, after = self.before_rad_s, self.after_rad_s
@@ -67,10 +67,10 @@ class Passage(NamedTuple):
         peak = (accel * duration + sign * (low + high)) / 2
         return sign * (peak - sqrt(max(0.0, peak * peak - (low * low + high * high) / 2 - accel * sign * way)))
 
-    def _at(self, cruise: float, accel: float) -> list[Piece]:
+    def _at(self, cruise: float, accel: float) -> list[CubicSegment]:
         """Returns the pieces: a ramp to the speed of the cruise, the cruise, and a ramp to the speed at the end."""
         first, last = (abs(cruise - speed) / accel for speed in (self.before_rad_s, self.after_rad_s))
-        pieces: list[Piece] = []
+        pieces: list[CubicSegment] = []
         at_s, position, velocity = self.begins_s, self.start_rad, self.before_rad_s
         for duration, rate in (
             (first, copysign(accel, cruise - self.before_rad_s)),
@@ -78,7 +78,7 @@ class Passage(NamedTuple):
             (last, copysign(accel, self.after_rad_s - cruise)),
         ):
             if duration > 0:
-                pieces.append(Piece(at_s, duration, position, velocity, rate, 0.0))
+                pieces.append(CubicSegment(at_s, duration, position, velocity, rate, 0.0))
                 position, velocity = pieces[-1].at(duration)
                 at_s += duration
         return pieces

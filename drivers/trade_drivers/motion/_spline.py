@@ -7,7 +7,7 @@ from math import copysign, sqrt
 from typing import Final, NamedTuple
 
 
-class Piece(NamedTuple):
+class CubicSegment(NamedTuple):
     """The cubic piece between two points, with a constant jerk."""
 
     begins_s: float
@@ -53,7 +53,7 @@ class Curve:
 
     __slots__ = ("_begins", "pieces")
 
-    def __init__(self, pieces: Sequence[Piece]) -> None:
+    def __init__(self, pieces: Sequence[CubicSegment]) -> None:
         self.pieces = tuple(pieces)
         self._begins = [piece.begins_s for piece in pieces]
 
@@ -86,13 +86,13 @@ class Curve:
         return piece.at(time_s - piece.begins_s)
 
 
-def cubic(begins_s: float, start: float, ends_s: float, end: float, before: float, after: float) -> Piece:
+def cubic(begins_s: float, start: float, ends_s: float, end: float, before: float, after: float) -> CubicSegment:
     """Returns the cubic piece between two points, each a time in s, an angle in rad, and a speed in rad/s."""
     duration = ends_s - begins_s
     slope = (end - start) / duration
     accel = 2 / duration * (3 * slope - 2 * before - after)
     jerk = 6 / duration**2 * (before + after - 2 * slope)
-    return Piece(begins_s, duration, start, before, accel, jerk)
+    return CubicSegment(begins_s, duration, start, before, accel, jerk)
 
 
 def _chosen(points: Sequence[tuple[float, float]]) -> list[float]:
@@ -105,7 +105,7 @@ def _chosen(points: Sequence[tuple[float, float]]) -> list[float]:
     return [0.0, *inner, 0.0]
 
 
-class Way(NamedTuple):
+class JointTask(NamedTuple):
     """One joint's task: its start, current speed, goal and limits."""
 
     start_rad: float
@@ -134,7 +134,7 @@ _LEAST_S: Final = 0.01
 """The duration of a path without length."""
 
 
-def there_together(ways: Sequence[Way]) -> list[Curve]:
+def there_together(ways: Sequence[JointTask]) -> list[Curve]:
     """Returns curves that start and arrive together, in a straight line after moving joints have braked.
 
     All share one trapezoidal speed profile: that of the slowest joint.
@@ -153,7 +153,7 @@ def there_together(ways: Sequence[Way]) -> list[Curve]:
     return [_trapezoid(way, sets_off_s, ramp_s, cruise_s) for way in ways]
 
 
-def _trapezoid(way: Way, sets_off_s: float, ramp_s: float, cruise_s: float) -> Curve:
+def _trapezoid(way: JointTask, sets_off_s: float, ramp_s: float, cruise_s: float) -> Curve:
     rest = way.rest_rad
     speed = (way.goal_rad - rest) / (ramp_s + cruise_s)
     knots = [(0.0, way.start_rad, way.velocity_rad_s if way.braking_s else 0.0)]

@@ -128,15 +128,15 @@ class Administration:
         children = self._by_container("children").items()
         return next((by for by, found in children if name in {child["name"] for child in found}), None)
 
-    async def switch(self, identity: str, name: str, what: str, *, on: bool) -> Done:
+    async def switch(self, identity: str, name: str, setting: str, *, on: bool) -> Done:
         """Switches ``discovery`` or ``broadcast`` of a container. Raises AccessDenied, NoSuchService."""
         self._judge.require_system(identity, "administer", f"container {name}")
 
         def switch() -> Done:
-            self.own(f"set_{what}", name)(on)
-            return Done(f"{what.capitalize()} is {'on' if on else 'off'} in {name}.")
+            self.own(f"set_{setting}", name)(on)
+            return Done(f"{setting.capitalize()} is {'on' if on else 'off'} in {name}.")
 
-        return await self.noted(identity, f"{what} {'on' if on else 'off'}", name, switch)
+        return await self.noted(identity, f"{setting} {'on' if on else 'off'}", name, switch)
 
     # --- providers
 
@@ -190,7 +190,7 @@ class Administration:
 
     # --- parts
 
-    async def noted(self, identity: str, what: str, about: str, do: Callable[[], Done], why: str = "") -> Done:
+    async def noted(self, identity: str, action: str, subject: str, do: Callable[[], Done], reason: str = "") -> Done:
         """Makes a change, and audits it in its client's name."""
 
         def noted() -> Done:
@@ -200,10 +200,10 @@ class Administration:
                 if not isinstance(error, AccessDenied):  # which the protocol audits
                     message = str(error)
                     self._container.note_request(
-                        what, about, client=identity, outcome=type(error).__name__, error=message
+                        action, subject, client=identity, outcome=type(error).__name__, error=message
                     )
                 raise
-            self._container.note_request(what, about, client=identity, error=why)
+            self._container.note_request(action, subject, client=identity, error=reason)
             return done
 
         return await self._counted(identity, noted)

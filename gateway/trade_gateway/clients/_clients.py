@@ -24,7 +24,7 @@ Place = tuple[object, str]
 """A resource, and the container that manages it."""
 
 
-class Held(Struct, frozen=True):
+class ClientLock(Struct, frozen=True):
     """A lock of a client."""
 
     lock: Lock
@@ -41,7 +41,7 @@ class Client:
         self.secret: Final = secrets.token_urlsafe(18)
         """The secret that proves a request to be its own."""
         self._left = left
-        self._locks: dict[str, Held] = {}
+        self._locks: dict[str, ClientLock] = {}
         self._runs: set[Run] = set()
         self._guard = threading.Lock()
         self._leaving = False
@@ -122,7 +122,7 @@ class Client:
     def keep(self, lock: Lock, handles: list[Handle]) -> str:
         """Stores a taken lock; returns its name."""
         name = secrets.token_hex(4)
-        self._locks[name] = Held(lock, frozenset(places(handles)))
+        self._locks[name] = ClientLock(lock, frozenset(places(handles)))
         if self.closed:  # closed meanwhile
             self.unlock(name)
         return name
@@ -224,21 +224,21 @@ class Quota:
         self._under_way: Counter[str] = Counter()
         self._guard = threading.Lock()
 
-    def take(self, who: str) -> Callable[[], None]:
+    def take(self, identity: str) -> Callable[[], None]:
         """Counts one; returns a function to call once at its end, on any thread. Raises TooMany."""
         with self._guard:
             if sum(self._under_way.values()) >= MOST_CALLS:
                 raise TooMany(what="pending calls", limit=MOST_CALLS)
-            if self._under_way[who] >= MOST_CALLS_OF_ONE:
-                raise TooMany(what=f"pending calls of {who}", limit=MOST_CALLS_OF_ONE)
-            self._under_way[who] += 1
-        return lambda: self._ended(who)
+            if self._under_way[identity] >= MOST_CALLS_OF_ONE:
+                raise TooMany(what=f"pending calls of {identity}", limit=MOST_CALLS_OF_ONE)
+            self._under_way[identity] += 1
+        return lambda: self._ended(identity)
 
-    def _ended(self, who: str) -> None:
+    def _ended(self, identity: str) -> None:
         with self._guard:
-            self._under_way[who] -= 1
-            if not self._under_way[who]:
-                del self._under_way[who]
+            self._under_way[identity] -= 1
+            if not self._under_way[identity]:
+                del self._under_way[identity]
 
 
 def places(handles: Iterable[Handle]) -> set[Place]:

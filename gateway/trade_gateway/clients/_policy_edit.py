@@ -41,9 +41,9 @@ def changes(before: Policy, after: Policy) -> list[str]:
     return found
 
 
-def _changed(who: str, may: str, groups: Iterable[str]) -> list[str]:
+def _changed(identity: str, may: str, groups: Iterable[str]) -> list[str]:
     named = ", ".join(sorted(groups))
-    return [f"{who} {may} {named}.".replace("  ", " ")] if named else []
+    return [f"{identity} {may} {named}.".replace("  ", " ")] if named else []
 
 
 def _sorted(approval: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:

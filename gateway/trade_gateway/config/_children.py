@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
+from trade_gateway.config._entry import ContainerSpec, ContainerTable, FileDefaults
 from trade_gateway.config._tables import Tables, read_entry
 
 _LEASE_S: Final = 10.0
@@ -14,7 +14,7 @@ _MISSES: Final = 4
 """How many health checks in a row may fail before a container counts as hung."""
 
 
-class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Supervised(ContainerTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One container that a gateway starts and restarts."""
 
     restart: Literal["always", "never"] = "always"
@@ -118,7 +118,7 @@ class _OfGateway(Tables):
         super().__init__(path, text, defaults, entries)
         self._certified = certified
 
-    def check_kind(self, name: str, entry: Entry) -> None:
+    def check_kind(self, name: str, entry: ContainerTable) -> None:
         super().check_kind(name, entry)
         if not entry.is_local:
             self.refuse(name, "host", "a gateway supervises containers of its own host; leave it out")

@@ -47,7 +47,7 @@ class HealthSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, 
     """The longest time that the command may take, in seconds."""
 
 
-class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+class ContainerTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """One container. Paths are relative to the system file; those of another host are paths there."""
 
     host: _Text = LOCAL
@@ -141,7 +141,7 @@ class ContainerSpec(NamedTuple):
     """A container, with the command that starts it."""
 
     name: str
-    entry: Entry
+    entry: ContainerTable
     words: Sequence[str]
     """The words after ``trade``; of a program, the program and its arguments."""
     environment: Mapping[str, str]

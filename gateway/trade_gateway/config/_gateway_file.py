@@ -371,9 +371,9 @@ def _explained(found: Mismatch, raw: Mapping[str, Any], where: str) -> Configura
     return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=found.problem)
 
 
-def _fits(part: object, kind: type[Struct] | None) -> bool:
+def _fits(part: object, type_: type[Struct] | None) -> bool:
     try:
-        msgspec.convert(part, kind or dict[str, Any])
+        msgspec.convert(part, type_ or dict[str, Any])
     except msgspec.ValidationError:
         return False
     return True

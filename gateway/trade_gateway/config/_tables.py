@@ -26,16 +26,16 @@ from trade_gateway.config._entry import (
     LOCAL,
     ONLY_WITH,
     ContainerSpec,
-    Entry,
+    ContainerTable,
     FileDefaults,
 )
 from trade_gateway.config._kind import PRODUCTS, ContainerKind, kind_of_product
 from trade_gateway.config._toml_file import at
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-_DEFAULTS: Final = Entry()
+_DEFAULTS: Final = ContainerTable()
 _Read = TypeVar("_Read", bound=Struct)
-_Entry = TypeVar("_Entry", bound=Entry)
+_Entry = TypeVar("_Entry", bound=ContainerTable)
 
 
 class Tables:
@@ -48,7 +48,7 @@ class Tables:
         entries: the tables by name.
     """
 
-    def __init__(self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, Entry]) -> None:
+    def __init__(self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, ContainerTable]) -> None:
         self.path = path
         self.defaults = defaults
         self._text = text
@@ -84,14 +84,14 @@ class Tables:
         return part
 
     @contextmanager
-    def errors_in(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
+    def errors_in(self, name: str, entry: ContainerTable, key: str = "") -> Generator[None]:
         """Reports errors inside as errors of a container's table."""
         try:
             yield
         except ConfigurationError as wrong:
             self.refuse(name, key or (entry.kind if entry.file else ""), str(wrong))
 
-    def check_kind(self, name: str, entry: Entry) -> None:
+    def check_kind(self, name: str, entry: ContainerTable) -> None:
         """Raises ConfigurationError if keys exclude each other."""
         kinds = [kind for kind in KINDS if getattr(entry, kind) not in ("", None)]
         if len(kinds) != 1:
@@ -105,7 +105,7 @@ class Tables:
         if entry.program is not None:
             self._check_program(name, entry)
 
-    def _check_program(self, name: str, entry: Entry) -> None:
+    def _check_program(self, name: str, entry: ContainerTable) -> None:
         if not entry.is_local:
             self.refuse(name, "host", "a program runs on the host of its supervisor; name it in the gateway file there")
         if entry.announces and entry.health is not None:
@@ -115,7 +115,7 @@ class Tables:
         if unset := [key for key in entry.env if not _VARIABLE.fullmatch(key)]:
             self.refuse(name, "env", f"{unset[0]!r} is no name of a variable")
 
-    def _check_program_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+    def _check_program_here(self, name: str, entry: ContainerTable, environment: Mapping[str, str]) -> None:
         folder, path = self.beside(entry.folder), {**self.defaults.inherited, **environment}.get("PATH")
         if not folder.is_dir():
             self.refuse(name, "folder" if entry.folder else "program", f"there is no folder {folder}")
@@ -130,7 +130,7 @@ class Tables:
         """Returns a program as an absolute path, or its bare name if it is to be found in PATH."""
         return str(self.beside(named)) if "/" in named else named
 
-    def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+    def check_here(self, name: str, entry: ContainerTable, environment: Mapping[str, str]) -> None:
         """Raises ConfigurationError if something that it needs on this host is missing or wrong."""
         self._check_installed(name, entry)
         product, value = _product_of(entry)
@@ -157,7 +157,7 @@ class Tables:
                 environment={**self.defaults.inherited, **environment},
             )
 
-    def _check_installed(self, name: str, entry: Entry) -> None:
+    def _check_installed(self, name: str, entry: ContainerTable) -> None:
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
         product, value = _product_of(entry)
@@ -165,7 +165,7 @@ class Tables:
             if importlib.util.find_spec(library) is None:
                 self.refuse(name, entry.kind, f"needs the extra {extra}; pip install 'trade-gateway[{extra}]'")
 
-    def _words(self, name: str, entry: Entry) -> list[str]:
+    def _words(self, name: str, entry: ContainerTable) -> list[str]:
         if entry.program is not None:
             return [self.program_path(entry.program[0]), *entry.program[1:]]
         dialled = [] if entry.gateway else [word for one in self._connect(entry) for word in ("--connect", one)]
@@ -186,13 +186,13 @@ class Tables:
                 does = ["container", "--name", name, *patterns]
         return ["--system", self.defaults.system, *dialled, *does]
 
-    def _path(self, entry: Entry, named: str) -> str:
+    def _path(self, entry: ContainerTable, named: str) -> str:
         return str(self.beside(named)) if entry.is_local else named
 
-    def _connect(self, entry: Entry) -> Sequence[str]:
+    def _connect(self, entry: ContainerTable) -> Sequence[str]:
         return self.defaults.connect if entry.connect is None else entry.connect
 
-    def _environment_of(self, entry: Entry) -> dict[str, str]:
+    def _environment_of(self, entry: ContainerTable) -> dict[str, str]:
         defaults = self.defaults if entry.is_local else FileDefaults(system=self.defaults.system)
         named = self.environment(entry.tls or defaults.tls, entry.policy or defaults.policy, entry.host)
         if entry.listen:
@@ -227,15 +227,15 @@ class Tables:
         raise ConfigurationError(where=at(self.path, self._text, ("container", name), key), problem=problem) from None
 
 
-def _product_of(entry: Entry) -> tuple[ContainerKind | None, Any]:
+def _product_of(entry: ContainerTable) -> tuple[ContainerKind | None, Any]:
     """Returns what a product knows of a container, with the value that is for it; None for other kinds."""
     kind = entry.kind
     return (kind_of_product(kind) if kind in PRODUCTS else None), getattr(entry, kind)
 
 
-def read_entry(raw: object, kind: type[_Entry], path: Path, text: str, table: tuple[str, ...]) -> _Entry:
+def read_entry(raw: object, type_: type[_Entry], path: Path, text: str, table: tuple[str, ...]) -> _Entry:
     """Converts the table of a container, with the tables in it that products know. Raises ConfigurationError."""
-    entry = converted(raw, kind, path, text, table)
+    entry = converted(raw, type_, path, text, table)
     checked: dict[str, Any] = {}
     for key in PRODUCTS:
         value, inner = getattr(entry, key), kind_of_product(key).table
@@ -244,14 +244,16 @@ def read_entry(raw: object, kind: type[_Entry], path: Path, text: str, table: tu
     return structs.replace(entry, **checked)
 
 
-def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...], inside: str = "") -> _Read:
+def converted(
+    raw: object, type_: type[_Read], path: Path, text: str, table: tuple[str, ...], inside: str = ""
+) -> _Read:
     """Converts a table, or the one inside it under a key, to its type. Raises ConfigurationError with the line."""
     try:
-        return msgspec.convert(raw, kind)
+        return msgspec.convert(raw, type_)
     except msgspec.ValidationError as bad:
         found = mismatch(bad)
     key = inside or re.split(r"[.\[]", found.place, maxsplit=1)[0]
-    fields = INSIDE.get(key, kind).__struct_encode_fields__
+    fields = INSIDE.get(key, type_).__struct_encode_fields__
     problem = found.problem
     if found.unknown:
         key, problem = key or found.unknown, f"unknown key {found.unknown!r}; there is {', '.join(fields)}"

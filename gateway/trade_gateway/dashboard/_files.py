@@ -55,13 +55,13 @@ def pages() -> list[Route]:
     return [_route(path, (folder / name).read_bytes(), kind) for path, name, kind in _FILES]
 
 
-def _route(path: str, body: bytes, kind: str) -> Route:
+def _route(path: str, body: bytes, content_type: str) -> Route:
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
 
     async def answer(request: Request) -> Response:
         headers = {**HEADERS, "ETag": tag}
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers=headers)
-        return Response(body, headers=headers, media_type=kind)
+        return Response(body, headers=headers, media_type=content_type)
 
     return Route(path, answer, methods=["GET"])

@@ -139,10 +139,10 @@ class Authenticator:
             raise AccessDenied(who=who, verb="call", what="the HTTP gateway", rule=f"{who} is revoked")
         return who
 
-    def still(self, scope: Scope, who: str) -> bool:
+    def still(self, scope: Scope, identity: str) -> bool:
         """Whether the client is still admitted as that identity."""
         try:
-            return self.who(scope) == who
+            return self.who(scope) == identity
         except (NotAuthenticated, AccessDenied):
             return False
 

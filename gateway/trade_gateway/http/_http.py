@@ -329,9 +329,9 @@ def refusal(error: TradeError) -> Response:
     return problem_response(error, headers)
 
 
-async def _body(request: Request, kind: type[Body]) -> Body:
+async def _body(request: Request, body_type: type[Body]) -> Body:
     """Decodes the client's body as the given record; an empty body is an empty record."""
-    return messages.read(await received(request) or b"{}", msgspec.json.Decoder(kind))
+    return messages.read(await received(request) or b"{}", msgspec.json.Decoder(body_type))
 
 
 async def received(request: Request) -> bytes:

@@ -63,7 +63,7 @@ class Socket:
             await asyncio.shield(asyncio.ensure_future(self._api.in_thread(client.close, stops=True)))
 
 
-class _Ongoing:
+class _Operation:
     """The operation that a message has begun."""
 
     def __init__(self, request: messages.Asked, handle: Handle | None, admitted: int) -> None:
@@ -123,7 +123,7 @@ class Conversation:
         self._client = client
         self._api = api
         self._tasks = anyio.create_task_group()
-        self._ongoing: dict[messages.Id, _Ongoing] = {}
+        self._ongoing: dict[messages.Id, _Operation] = {}
         self._stops: defaultdict[object, _Line] = defaultdict(_Line)
         """For each stop service, its running stops."""
         self._speaking = anyio.Lock()
@@ -199,7 +199,7 @@ class Conversation:
         self._ongoing[asked.id] = ongoing
         self._tasks.start_soon(self._do, ongoing)
 
-    def _admitted(self, request: messages.Asked) -> _Ongoing:
+    def _admitted(self, request: messages.Asked) -> _Operation:
         """Checks a request. Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot begin."""
         if request.id in self._ongoing:
             raise BadMessage(problem=f"the operation with id {request.id!r} has not ended yet. Use another id")
@@ -214,9 +214,9 @@ class Conversation:
             raise TooMany(
                 what="stops of this connection that wait for their answer (they are executed)", limit=_MOST_ANSWERS
             )
-        return _Ongoing(request, handle, admitted)
+        return _Operation(request, handle, admitted)
 
-    async def _do(self, ongoing: _Ongoing) -> None:
+    async def _do(self, ongoing: _Operation) -> None:
         result, name = None, ongoing.asked.id
         try:
             with ongoing.scope:
@@ -229,7 +229,7 @@ class Conversation:
         del self._ongoing[name]
         await self._say(answer)
 
-    async def _done(self, ongoing: _Ongoing) -> Any:
+    async def _done(self, ongoing: _Operation) -> Any:
         match asked := ongoing.asked:
             case messages.Call():
                 assert ongoing.handle is not None  # noqa: S101 - the check of the request has found it
@@ -254,7 +254,7 @@ class Conversation:
 
     # --- operations
 
-    async def _stop(self, which: object, ongoing: _Ongoing) -> Any:
+    async def _stop(self, which: object, ongoing: _Operation) -> Any:
         """Runs a stop; it counts for all requests before its start."""
 
         async def stop() -> Any:
@@ -268,7 +268,7 @@ class Conversation:
             if line.idle:
                 self._stops.pop(which, None)
 
-    async def _call(self, request: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
+    async def _call(self, request: messages.Call, handle: Handle, ongoing: _Operation) -> Any:
         self._api.judge.require_unmarked(self._client.identity, handle)
         async with nullcontext() if handle.effect == "stop" else self._beginning:
             run = await self._api.begin(self._client, handle, request, ongoing.admitted)

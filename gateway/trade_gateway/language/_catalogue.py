@@ -6,11 +6,11 @@ from typing import Final
 from trade_gateway.language._motion_orders import MOTION_ORDERS
 from trade_gateway.language._orders import ORDERS
 from trade_gateway.language._questions import QUESTIONS
-from trade_gateway.language._requests import Answer, Asker, Gaps, Request
+from trade_gateway.language._requests import Answer, Gaps, Request, Requester
 from trade_gateway.language._states import STATES
 
 
-def _in_dialogue(_asker: Asker, _gaps: Gaps) -> Answer:
+def _in_dialogue(_asker: Requester, _gaps: Gaps) -> Answer:
     raise NotImplementedError  # the dialogue handles it before
 
 

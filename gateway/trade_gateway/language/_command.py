@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.language import Lexicon, Memory, Model, Reply, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Lexicon, Memory, Model, Reply, read_lexicon
 from trade_gateway.terminal import sections
 from trade_gateway.terminal._options import Json
 from trade_gateway.terminal._output import Output, say_error
@@ -49,7 +49,7 @@ def ask(
     with visitor_among_others(context) as container:
         settings = choice_of(context).settings()
         folder = container.settings.state_dir
-        talk = Talk(
+        dialogue = Dialogue(
             container,
             known,
             Memory(None if folder is None else folder / container.settings.system / _FILE),
@@ -60,11 +60,11 @@ def ask(
         )
         try:
             if sentence:
-                _once(out, talk.say(" ".join(sentence), confirmed=yes))
+                _once(out, dialogue.say(" ".join(sentence), confirmed=yes))
             else:
-                _dialogue(out, talk)
+                _dialogue(out, dialogue)
         finally:
-            talk.close()
+            dialogue.close()
 
 
 def _once(out: Output, reply: Reply) -> None:
@@ -81,12 +81,12 @@ def _once(out: Output, reply: Reply) -> None:
     raise typer.Exit(1)
 
 
-def _dialogue(out: Output, talk: Talk) -> None:
+def _dialogue(out: Output, dialogue: Dialogue) -> None:
     out.say("type one sentence per line; Ctrl-D ends")
     for line in sys.stdin:
         if line.strip():
             try:
-                _answer(out, talk.say(line))
+                _answer(out, dialogue.say(line))
             except Exception as error:  # noqa: BLE001 - the dialogue and its locks continue
                 say_error(error)
 

@@ -13,11 +13,11 @@ from trade import Container
 from trade.errors import LockLost
 from trade_gateway._usage import find
 from trade_gateway.language._catalogue import REQUESTS
-from trade_gateway.language._lexicon import NUMBERS, Heard, Lexicon, NotUnderstood, Phrase
+from trade_gateway.language._lexicon import NUMBERS, Lexicon, NotUnderstood, Phrase, PhraseMatch
 from trade_gateway.language._memory import Memory
 from trade_gateway.language._model import Model
 from trade_gateway.language._orders import permitted
-from trade_gateway.language._requests import Ambiguous, Answer, Asker, Gaps, Plan, Unknown
+from trade_gateway.language._requests import Ambiguous, Answer, Gaps, Plan, Requester, Unknown
 
 _WAIT_S: Final = 1.0
 _CONFIRM_S: Final = 60.0
@@ -42,18 +42,18 @@ class Reply(Struct, frozen=True):
 
 
 class _Pending(NamedTuple):
-    heard: Heard
+    heard: PhraseMatch
     plan: Plan
     asked_at: float
 
 
 class _Choice(NamedTuple):
-    heard: Heard
+    heard: PhraseMatch
     which: Ambiguous
     by_model: bool
 
 
-class Talk:
+class Dialogue:
     """Understands sentences by a lexicon, and executes them as a given container.
 
     Args:
@@ -77,12 +77,12 @@ class Talk:
         show: Callable[[str], None] = lambda _: None,
         keeps: bool = False,
     ) -> None:
-        self._asker = Asker(container, memory, audit, keeps)
+        self._asker = Requester(container, memory, audit, keeps)
         self._container = container
         self._lexicon = lexicon
         self._model = model
         self._show = show
-        self._last: Heard | None = None
+        self._last: PhraseMatch | None = None
         self._gaps: Gaps = {}
         self._pending: _Pending | None = None
         self._choice: _Choice | None = None
@@ -132,7 +132,7 @@ class Talk:
 
     # --- what a sentence asks for
 
-    def _heard(self, sentence: str, choice: _Choice | None) -> tuple[Heard, bool]:
+    def _heard(self, sentence: str, choice: _Choice | None) -> tuple[PhraseMatch, bool]:
         """The meaning of a sentence, and whether it is the proposal of a model."""
         try:
             return self._lexicon.hear(sentence), False
@@ -145,7 +145,7 @@ class Talk:
         self._show(_shown(heard))
         return heard, True
 
-    def _found(self, sentence: Heard) -> Answer | Plan:
+    def _found(self, sentence: PhraseMatch) -> Answer | Plan:
         phrase, gaps = sentence
         return self._planned_call(phrase, gaps) if phrase.call else REQUESTS[phrase.ask].ask(self._asker, gaps)
 
@@ -163,7 +163,7 @@ class Talk:
         shall, stops = f"call {service.label}({', '.join(shown)})", service.effect == "stop"
         return Plan(shall, do, confirm=service.effect not in _HARMLESS, stops=stops)
 
-    def _repeated(self, sentence: Heard) -> Heard:
+    def _repeated(self, sentence: PhraseMatch) -> PhraseMatch:
         """The last question, with another name. Raises Unknown."""
         if self._last is None:
             raise Unknown("that repeats a question, and none was asked just before. Say the whole sentence")
@@ -175,12 +175,12 @@ class Talk:
         words = name.split()
         if words[-1].lower() == "one" and len(words) > 1:
             name = " ".join([*words[:-1], *gaps[gap].split()[-1:]])
-        return Heard(phrase, self._lexicon.named({**gaps, gap: name}))
+        return PhraseMatch(phrase, self._lexicon.named({**gaps, gap: name}))
 
-    def _referred(self, sentence: Heard) -> Heard:
+    def _referred(self, sentence: PhraseMatch) -> PhraseMatch:
         """The sentence, with the name of the last sentence in place of "it"."""
         gaps = {gap: self._gaps.get(gap, text) if text.lower() in _IT else text for gap, text in sentence.gaps.items()}
-        return Heard(sentence.phrase, gaps)
+        return PhraseMatch(sentence.phrase, gaps)
 
     # --- doing it
 
@@ -196,7 +196,7 @@ class Talk:
             raise NotUnderstood(where=repr(sentence), problem=problem)
         return self._done(pending.heard, pending.plan)
 
-    def _done(self, sentence: Heard, plan: Plan) -> Reply:
+    def _done(self, sentence: PhraseMatch, plan: Plan) -> Reply:
         """Executes an order, under the locks of the dialogue. Raises LockLost once for each of them that is lost."""
         self._last, self._gaps = None, sentence.gaps  # a follow-up repeats a question, and never an order
         try:
@@ -210,7 +210,7 @@ class Talk:
             raise
 
 
-def _reply(sentence: Heard, answer: Answer) -> Reply:
+def _reply(sentence: PhraseMatch, answer: Answer) -> Reply:
     phrase = sentence.phrase
     template = phrase.say
     if answer.count == 0 and phrase.none:
@@ -220,21 +220,21 @@ def _reply(sentence: Heard, answer: Answer) -> Reply:
     return Reply(template.format(**{**sentence.gaps, **answer.fields}).strip(), phrase.means, answer.data)
 
 
-def _chosen(sentence: str, choice: _Choice) -> Heard | None:
+def _chosen(sentence: str, choice: _Choice) -> PhraseMatch | None:
     """The ambiguous sentence with the meaning that this one chooses, if it chooses exactly one."""
     words = set(_words(sentence)) - {"the", "one", "i", "mean", "on", "in"}
     fit = [one for one in choice.which.choices if words and words <= set(_words(one))]
     exact = [one for one in fit if words == set(_words(one))]
     fit = exact if len(exact) == 1 else fit
     heard = choice.heard
-    return Heard(heard.phrase, {**heard.gaps, choice.which.gap: fit[0]}) if len(fit) == 1 else None
+    return PhraseMatch(heard.phrase, {**heard.gaps, choice.which.gap: fit[0]}) if len(fit) == 1 else None
 
 
 def _words(text: str) -> list[str]:
     return "".join(letter if letter.isalnum() else " " for letter in text.lower()).split()
 
 
-def _shown(sentence: Heard) -> str:
+def _shown(sentence: PhraseMatch) -> str:
     """A request as it is shown: ``migrate(group='planner', place='base')``."""
     return f"{sentence.phrase.means}({', '.join(f'{gap}={text!r}' for gap, text in sentence.gaps.items())})"
 

@@ -89,7 +89,7 @@ class Phrase(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return bool(self.call) or REQUESTS[self.ask].is_order
 
 
-class Heard(NamedTuple):
+class PhraseMatch(NamedTuple):
     """The phrase that matches a sentence, and its gaps."""
 
     phrase: Phrase
@@ -121,13 +121,13 @@ class Lexicon:
         self.sentences: Final = [phrase.hear[0] for phrase in shown]
         """One sentence of each phrase, for help: the questions, then the orders."""
 
-    def hear(self, sentence: str) -> Heard:
+    def hear(self, sentence: str) -> PhraseMatch:
         """Finds the phrase of a sentence. Raises NotUnderstood."""
         for heard in _forms(_plain(sentence)):
             for pattern, _, phrase in self._patterns:
                 if found := pattern.fullmatch(heard):
                     gaps = {gap: text for gap, text in found.groupdict().items() if text is not None}
-                    return Heard(phrase, self.named(gaps))
+                    return PhraseMatch(phrase, self.named(gaps))
         problem = f"I do not understand that. I do understand, for example: {'; '.join(self.sentences[:6])}"
         raise NotUnderstood(where=repr(sentence), problem=problem)
 

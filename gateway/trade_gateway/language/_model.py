@@ -17,7 +17,7 @@ from msgspec import Struct
 from trade import Container
 from trade.errors import ConfigurationError
 from trade_gateway.language._catalogue import DIALOGUE
-from trade_gateway.language._lexicon import Heard, Lexicon, NotUnderstood, Phrase, is_question
+from trade_gateway.language._lexicon import Lexicon, NotUnderstood, Phrase, PhraseMatch, is_question
 from trade_gateway.language._names import others
 
 _LIMIT_S: Final = 30.0
@@ -57,7 +57,7 @@ class Model:
         if not self._command:
             raise ConfigurationError(where="--model", problem="names no command")
 
-    def propose(self, sentence: str, lexicon: Lexicon, container: Container) -> Heard:
+    def propose(self, sentence: str, lexicon: Lexicon, container: Container) -> PhraseMatch:
         """Returns the request that the model proposes for a sentence, after all checks that a typed one gets.
 
         Raises:
@@ -79,7 +79,7 @@ class Model:
             raise _refused(sentence, problem)
         if phrase.is_order:
             _require_asked(sentence, phrase, gaps.values())
-        return Heard(phrase, gaps)
+        return PhraseMatch(phrase, gaps)
 
     def _ask(self, request: bytes) -> bytes:
         """Runs the command once; kills it, and all that it started, when it ends or its time is over."""

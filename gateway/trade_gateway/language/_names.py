@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from trade import Container, ContainerInfo, Handle, where
-from trade_gateway.language._requests import Ambiguous, Answer, Asker, Gaps, Unknown
+from trade_gateway.language._requests import Ambiguous, Answer, Gaps, Requester, Unknown
 
 __all__ = ["Place", "groups_named", "matching", "names", "one_container", "one_group", "one_of", "others", "place"]
 __all__ += ["in_words", "provider_of", "resources"]
@@ -49,9 +49,9 @@ def matching(container: Container, gaps: Gaps) -> list[Handle]:
     return found
 
 
-def groups_named(asker: Asker, words: str) -> list[str]:
+def groups_named(requester: Requester, words: str) -> list[str]:
     """The whole names of the groups that these words mean. Raises Unknown."""
-    found = _ending(words, others(asker.container), _groups, "group")
+    found = _ending(words, others(requester.container), _groups, "group")
     every = sorted({group for handle in found for group in _groups(handle)})
     if words.lower() in every:
         return [words.lower()]
@@ -59,18 +59,18 @@ def groups_named(asker: Asker, words: str) -> list[str]:
     return next(filter(None, fits), every)
 
 
-def one_group(asker: Asker, words: str) -> str:
+def one_group(requester: Requester, words: str) -> str:
     """The group that these words mean. Raises Unknown, Ambiguous."""
-    found = groups_named(asker, words)
+    found = groups_named(requester, words)
     if len(found) > 1:
         raise Ambiguous("group", found)
     return found[0]
 
 
-def provider_of(asker: Asker, words: str) -> Handle:
+def provider_of(requester: Requester, words: str) -> Handle:
     """A service of the only provider that these words mean. Raises Unknown, Ambiguous."""
-    group = one_group(asker, words)
-    found = [handle for handle in others(asker.container) if group in _groups(handle)]
+    group = one_group(requester, words)
+    found = [handle for handle in others(requester.container) if group in _groups(handle)]
     providers = {(handle.key.address, handle.key.domain, handle.key.provider): handle for handle in found}
     if len(providers) == 1:
         return found[0]
@@ -122,10 +122,10 @@ def _words(name: str) -> list[str]:
 # --- containers and hosts
 
 
-def place(asker: Asker, words: str | None) -> Place:
+def place(requester: Requester, words: str | None) -> Place:
     """The containers that some words mean; all, without words. Raises Unknown, Ambiguous."""
-    own = asker.container.address.epoch
-    infos = sorted((info for info in asker.container.containers() if info.epoch != own), key=lambda info: info.name)
+    own = requester.container.address.epoch
+    infos = sorted((info for info in requester.container.containers() if info.epoch != own), key=lambda info: info.name)
     if words is None:
         return Place("", tuple(infos))
     kind = _KIND.match(words) or _KIND_AFTER.search(words)
@@ -146,9 +146,9 @@ def place(asker: Asker, words: str | None) -> Place:
     return found[0]
 
 
-def one_container(asker: Asker, words: str | None, without: str = "") -> ContainerInfo:
+def one_container(requester: Requester, words: str | None, without: str = "") -> ContainerInfo:
     """The only container of a place, except one. Raises Unknown, Ambiguous."""
-    there = place(asker, words)
+    there = place(requester, words)
     found = [info for info in there.containers if info.name != without]
     if len(found) == 1:
         return found[0]

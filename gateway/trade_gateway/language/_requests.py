@@ -35,7 +35,7 @@ class Ambiguous(Exception):
 
 
 @dataclass
-class Asker:
+class Requester:
     """Who asks: requests look and act as this container."""
 
     container: Container
@@ -77,13 +77,13 @@ class Request(NamedTuple):
     """Its gaps."""
     fields: tuple[str, ...]
     """The parts of its answer."""
-    ask: Callable[[Asker, Gaps], Answer | Plan]
+    ask: Callable[[Requester, Gaps], Answer | Plan]
     """Answers a question; plans an order, without doing anything."""
     is_order: bool = False
     """Whether it acts on the system."""
 
 
-def order(gaps: tuple[str, ...], plan: Callable[[Asker, Gaps], Plan]) -> Request:
+def order(gaps: tuple[str, ...], plan: Callable[[Requester, Gaps], Plan]) -> Request:
     """An order whose answer has a report."""
     return Request(gaps, ("count", "report"), plan, is_order=True)
 

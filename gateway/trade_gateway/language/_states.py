@@ -12,7 +12,7 @@ from trade.auditing import AuditRow, reading, records_in
 from trade.protocol.messages import HEALTHY
 from trade.timestamps import clock
 from trade_gateway.language._names import in_words, matching, others, place, resources
-from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
+from trade_gateway.language._requests import Answer, Gaps, Request, Requester, Unknown
 
 _ROWS: Final = 5_000
 """How many of the last rows of an audit record are read."""
@@ -23,32 +23,32 @@ _ANSWER_S: Final = 2.0
 # --- why
 
 
-def _why(asker: Asker, gaps: Gaps) -> Answer:
-    found = matching(asker.container, gaps)
+def _why(requester: Requester, gaps: Gaps) -> Answer:
+    found = matching(requester.container, gaps)
     wanted = resources(handle for handle in found if handle.effect == "actuate")
     reasons = [
         f"an e-stop is open, by {one.giver}, since {clock(one.at)}{f': {one.reason}' if one.reason else ''}"
-        for one in asker.container.estops()
+        for one in requester.container.estops()
     ]
-    reasons += _stops(asker, [handle for handle in found if handle.effect == "actuate"], wanted)
+    reasons += _stops(requester, [handle for handle in found if handle.effect == "actuate"], wanted)
     bad = {f"{(handle.groups or (handle.label,))[0]} is {handle.health}" for handle in found}
     reasons += sorted(text for text in bad if not text.endswith(f" is {HEALTHY}"))
-    known = asker.container.lock_api.known()
+    known = requester.container.lock_api.known()
     held = [info for info in known.locks if not wanted.isdisjoint(info.resources)]
     reasons += [f"{', '.join(info.resources)} {info.holder.purpose}" for info in held if not info.token.number]
     reasons += [f"{info.holder.owner} has locked {', '.join(info.resources)}" for info in held if info.token.number]
     reasons += [f"of {silent.container} it is not known, it does not answer" for silent in known.silent]
-    noted = _noted(asker.audit, found)
+    noted = _noted(requester.audit, found)
     fields = {"count": len(reasons), "reasons": "; ".join([*reasons, *noted]), "noted": "; ".join(noted)}
     return Answer(len(reasons), fields, [*reasons, *noted])
 
 
-def _stops(asker: Asker, found: Iterable[Handle], wanted: set[str]) -> list[str]:
+def _stops(requester: Requester, found: Iterable[Handle], wanted: set[str]) -> list[str]:
     """The stops that hold these resources; an e-stop only if it was cleared, and the resource waits for `resume`."""
     addresses = {handle.key.address for handle in found}
-    asked = asker.container.services(where(name="stops", group="trade") & ~where.local)
+    asked = requester.container.services(where(name="stops", group="trade") & ~where.local)
     asked = [handle.with_(deadline_s=_ANSWER_S) for handle in asked if handle.key.address in addresses]
-    answered = [outcome for outcome in asker.container.call_all(asked) if outcome.ok]
+    answered = [outcome for outcome in requester.container.call_all(asked) if outcome.ok]
     stops: dict[tuple[str, str], list[str]] = {}
     for info in [info for outcome in answered for info in outcome.result]:
         if info.resource in wanted and not info.estop:
@@ -85,27 +85,27 @@ def _last_rows(folder: Path | None) -> Iterator[AuditRow]:
 # --- who may
 
 
-def _movers(asker: Asker, gaps: Gaps) -> Answer:
-    moved = [handle for handle in matching(asker.container, gaps) if handle.effect == "actuate"]
+def _movers(requester: Requester, gaps: Gaps) -> Answer:
+    moved = [handle for handle in matching(requester.container, gaps) if handle.effect == "actuate"]
     if not moved:
         raise Unknown(f"{gaps['group']} has no service that moves it")
-    locked = _held(asker, resources(moved))
-    policy = asker.container.access.policy
+    locked = _held(requester, resources(moved))
+    policy = requester.container.access.policy
     if policy is None:
         text = f"I know of no policy, so every client of the system may{locked}"
         return Answer(1, {"count": 1, "who": text}, None)
-    here = {info.identity for info in asker.container.containers()}
+    here = {info.identity for info in requester.container.containers()}
     known = sorted({*policy.names(), *policy.patterns(), *here})
     domains = {handle.key.domain for handle in moved}
     able = [name for name in known if all(policy.decide(name, "call", domain).allowed for domain in domains)]
-    own = asker.container.address.identity
+    own = requester.container.address.identity
     text = f"by {policy.source}, {in_words(able) or 'no identity'} may. You are {own}{locked}"
     return Answer(len(able), {"count": len(able), "who": text}, able)
 
 
-def _held(asker: Asker, wanted: set[str]) -> str:
+def _held(requester: Requester, wanted: set[str]) -> str:
     """Who has locked these, as an addition to a sentence."""
-    locks = asker.container.lock_api.known().locks
+    locks = requester.container.lock_api.known().locks
     owners = sorted({info.holder.owner for info in locks if not wanted.isdisjoint(info.resources)})
     return f". Now only {in_words(owners)} can, under a lock" if owners else ""
 
@@ -113,13 +113,13 @@ def _held(asker: Asker, wanted: set[str]) -> str:
 # --- what if
 
 
-def _loss(asker: Asker, gaps: Gaps) -> Answer:
-    there = place(asker, gaps["place"])
+def _loss(requester: Requester, gaps: Gaps) -> Answer:
+    there = place(requester, gaps["place"])
     lost = {info.epoch for info in there.containers}
-    handles = others(asker.container)
+    handles = others(requester.container)
     gone = sorted({handle.label for handle in handles if handle.key.address.epoch in lost})
     left = {handle.label for handle in handles if handle.key.address.epoch not in lost}
-    known = asker.container.lock_api.known()
+    known = requester.container.lock_api.known()
     there_used = resources(handle for handle in handles if handle.key.address.epoch in lost)
     sessions = {f"{info.identity}/{info.name}" for info in there.containers}
     locks = sorted(

@@ -44,7 +44,7 @@ class Request(Struct, frozen=True):
 publish("trade_gateway.mcp", Request)
 
 
-class _Waiting(Struct):
+class _PendingApproval(Struct):
     request: Request
     group: str
     tell: Callable[[str], None]
@@ -66,7 +66,7 @@ class Approvals:
         self._judge = ClientAuthorizer(container)
         self._ask_first = tuple(ask_first)
         self._guard = threading.Lock()
-        self._waiting: dict[str, _Waiting] = {}
+        self._waiting: dict[str, _PendingApproval] = {}
         self._offered = False
         self._offering = asyncio.Lock()
 
@@ -108,7 +108,7 @@ class Approvals:
         waiting.tell(verdict)
         return waiting.request
 
-    def _require(self, waiting: _Waiting) -> None:
+    def _require(self, waiting: _PendingApproval) -> None:
         call, agent = current_call(), waiting.request.agent
         client = "" if call is None else client_of(call.session)
         if call is None or (not client and call.session.startswith(f"{self._container.address}")):
@@ -128,7 +128,7 @@ class Approvals:
         """Whether a call of an agent needs approval."""
         return self._judge.needs_approval(agent, handle, self._ask_first)
 
-    async def ask(self, agent: str, handle: Handle, args: Any, why: str, wait_s: float) -> None:
+    async def ask(self, agent: str, handle: Handle, args: Any, reason: str, wait_s: float) -> None:
         """Waits for approval. Raises NeedsApproval: there was none within ``wait_s``."""
         text = msgspec.json.encode(args).decode()
         if len(text) > _MOST_TEXT:
@@ -142,8 +142,8 @@ class Approvals:
             if not answered.done():
                 answered.set_result(verdict)
 
-        request = Request(name, agent, handle.label, text, why[:_MOST_TEXT], now, now + wait_s)
-        waiting = _Waiting(request, handle.key.domain, lambda verdict: _soon(loop, partial(settle, verdict)))
+        request = Request(name, agent, handle.label, text, reason[:_MOST_TEXT], now, now + wait_s)
+        waiting = _PendingApproval(request, handle.key.domain, lambda verdict: _soon(loop, partial(settle, verdict)))
         with self._guard:
             if len(self._waiting) >= _MOST:
                 raise NeedsApproval(service=handle.label, reason=f"{_MOST} requests wait already")

@@ -28,7 +28,7 @@ _NEAR_RAD: Final = 0.005
 """A joint this near is not moved again."""
 
 
-class Tried(Struct, frozen=True):
+class TwinResult(Struct, frozen=True):
     """The result of a call on the twin."""
 
     ok: bool
@@ -62,7 +62,7 @@ class Twin:
         self._process: JsonChild | None = None
         self._container: Container | None = None
 
-    def call(self, handle: Handle, args: Any, deadline_s: float, states: Mapping[str, Any]) -> Tried:
+    def call(self, handle: Handle, args: Any, deadline_s: float, states: Mapping[str, Any]) -> TwinResult:
         """Brings the whole twin to the robot's position and makes the call there; one at a time.
 
         Args:
@@ -90,7 +90,7 @@ class Twin:
                 error = f"{type(failed).__name__}: {failed}"
             took_s = time.monotonic() - began
             placed, after = bool(states) and not elsewhere, self._state(here, group)
-            return Tried(not error, error, result, round(took_s, 3), placed, elsewhere, before, after)
+            return TwinResult(not error, error, result, round(took_s, 3), placed, elsewhere, before, after)
 
     def _up(self) -> Container:
         if self._container is not None and self._process is not None and self._process.running:

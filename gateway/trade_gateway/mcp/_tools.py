@@ -15,9 +15,9 @@ from trade.errors import LockLost, NoSuchService, TradeError
 from trade_gateway.clients import Client, ClientApi
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._errors import NeedsLock, NoSuchTool, NoTwin, WrongTool
-from trade_gateway.language import Lexicon, Memory, Talk
+from trade_gateway.language import Dialogue, Lexicon, Memory
 from trade_gateway.mcp._approvals import Approvals
-from trade_gateway.mcp._simulation_twin import Tried, Twin
+from trade_gateway.mcp._simulation_twin import Twin, TwinResult
 
 Progress = Callable[[Any], None]
 """Receives the progress of a call; on any thread."""
@@ -38,14 +38,14 @@ class Find(Struct, forbid_unknown_fields=True, kw_only=True):
     """A predicate that one of its post-conditions fits."""
 
 
-class Named(Struct, forbid_unknown_fields=True, kw_only=True):
+class ServiceArguments(Struct, forbid_unknown_fields=True, kw_only=True):
     group: messages.Group
     name: Annotated[str, Meta(min_length=1)]
     container: str = ""
     """Only the service of this container."""
 
 
-class ToCall(messages.CallBody, forbid_unknown_fields=True, kw_only=True):
+class CallArguments(messages.CallBody, forbid_unknown_fields=True, kw_only=True):
     group: messages.Group
     name: Annotated[str, Meta(min_length=1)]
     why: Annotated[str, _TEXT] = ""
@@ -65,7 +65,7 @@ class NoArgs(Struct, forbid_unknown_fields=True):
     pass
 
 
-class Described(Struct, frozen=True):
+class ServiceDescription(Struct, frozen=True):
     """A service with the JSON Schemas of its arguments and result."""
 
     service: messages.ServiceView
@@ -101,7 +101,7 @@ class Tools:
         self._client = client
         self._approvals = approvals
         self._twin = twin
-        self._talk = Talk(container, lexicon, Memory())
+        self._talk = Dialogue(container, lexicon, Memory())
         self._trying = anyio.CapacityLimiter(1)
         self._lost: list[str] = []
 
@@ -143,11 +143,11 @@ class Tools:
         found = self._api.seen(self._client.identity, request.group, request.name, request.needs, request.achieves)
         return [self._api.view(self._client.identity, handle) for handle in found]
 
-    async def describe(self, request: Named, _: Progress) -> Any:
+    async def describe(self, request: ServiceArguments, _: Progress) -> Any:
         """Describe one service: JSON Schemas of its arguments and result, and what a call of it needs."""
         handle = self._find(request.group, request.name, request.container)
         schema = handle.schema
-        return Described(
+        return ServiceDescription(
             self._api.view(self._client.identity, handle),
             schema["arguments"],
             schema["result"],
@@ -180,7 +180,7 @@ class Tools:
         """Release a lock; motion under it stops."""
         return {"released": await self._api.in_thread(self._client.unlock, request.lock)}
 
-    async def call(self, request: ToCall, progress: Progress) -> Any:
+    async def call(self, request: CallArguments, progress: Progress) -> Any:
         """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
         handle = self._find(request.group, request.name, request.container)
         self._require_lock(handle)
@@ -200,14 +200,14 @@ class Tools:
                     await self._api.end(self._client, run)
         return {"result": run.result(0)}
 
-    async def try_on_twin(self, request: ToCall, _: Progress) -> Any:
+    async def try_on_twin(self, request: CallArguments, _: Progress) -> Any:
         """Try a call on a simulated twin, brought to where the whole robot is. Nothing real moves."""
         if self._twin is None:
             raise NoTwin(reason="this server has no twin")
         handle = self._find(request.group, request.name, request.container)
         states = await self._states_of(handle.key.domain.partition(".")[0])
         trying = partial(self._twin.call, handle, request.args, min(request.deadline_s, _TRIED_WITHIN_S), states)
-        tried: Tried = await run_sync(trying, abandon_on_cancel=True, limiter=self._trying)
+        tried: TwinResult = await run_sync(trying, abandon_on_cancel=True, limiter=self._trying)
         return tried  # nothing of the real robot waits for it
 
     async def stop(self, request: messages.GroupBody, _: Progress) -> Any:
@@ -285,13 +285,13 @@ class Tool(NamedTuple):
 
 TOOLS: Final = {
     "services": Tool(Find, Tools.services, reads=True),
-    "describe": Tool(Named, Tools.describe, reads=True),
+    "describe": Tool(ServiceArguments, Tools.describe, reads=True),
     "ask": Tool(Sentence, Tools.ask, reads=True),
     "locks": Tool(NoArgs, Tools.locks, reads=True),
     "lock": Tool(messages.LockBody, Tools.lock),
     "unlock": Tool(LockArgs, Tools.unlock),
-    "call": Tool(ToCall, Tools.call),
-    "dry_run": Tool(ToCall, Tools.try_on_twin, reads=True),
+    "call": Tool(CallArguments, Tools.call),
+    "dry_run": Tool(CallArguments, Tools.try_on_twin, reads=True),
     "stop": Tool(messages.GroupBody, Tools.stop),
     "estop": Tool(messages.EstopBody, Tools.estop),
 }

@@ -31,7 +31,7 @@ class _LeaseLines:
     """The leases on standard input."""
 
     def __init__(self) -> None:
-        self._said = b""
+        self._incomplete = b""
 
     def next(self) -> TimerLease:
         """Returns the latest lease; waits for one if there is none. Raises EOFError."""
@@ -40,7 +40,7 @@ class _LeaseLines:
             data = os.read(sys.stdin.fileno(), 65536)
             if not data:
                 raise EOFError
-            *lines, self._said = (self._said + data).split(b"\n")
+            *lines, self._incomplete = (self._incomplete + data).split(b"\n")
         return TimerLease.read(lines[-1].decode())
 
 

@@ -87,7 +87,7 @@ class _Program:
         os.set_blocking(self._wake, False)
         os.set_blocking(wake, False)
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-        self._asked = self._forced = False
+        self._stop_requested = self._forced = False
         self._status: int | None = None
         """The program's wait status."""
         self._kill_at = self._give_up_at = math.inf
@@ -115,11 +115,11 @@ class _Program:
                 with contextlib.suppress(BlockingIOError):
                     key.data()
         self._read_rest()
-        ended_as_asked = self._asked and not self._forced and self._status == signal.SIGTERM
+        ended_as_asked = self._stop_requested and not self._forced and self._status == signal.SIGTERM
         return 0 if ended_as_asked or self._status is None else self._status
 
     def _signalled(self, number: int, _frame: FrameType | None) -> None:
-        self._asked = self._asked or number != signal.SIGCHLD
+        self._stop_requested = self._stop_requested or number != signal.SIGCHLD
 
     def _any_left(self) -> bool:
         """Collects ended processes, and does what is due; returns whether to wait for more."""
@@ -130,9 +130,9 @@ class _Program:
         except ChildProcessError:
             return False
         now = time.monotonic()
-        if self._kill_at == math.inf and (self._asked or self._status is not None):
+        if self._kill_at == math.inf and (self._stop_requested or self._status is not None):
             left = _descendants()
-            if not self._asked:
+            if not self._stop_requested:
                 self.log.say("it left processes in the background, which end with it; run it in the foreground")
             _signal(left, signal.SIGTERM)
             _signal(left, signal.SIGCONT)  # a stopped process handles no signal
@@ -165,7 +165,7 @@ class _Program:
     def _lifeline(self) -> None:
         if not os.read(0, _READ_BYTES):
             self._selector.unregister(0)
-            self._asked = True
+            self._stop_requested = True
 
 
 def _descendants() -> list[int]:

@@ -177,12 +177,12 @@ def inlined(schema: Mapping[str, Any]) -> dict[str, Any]:
     return cast("dict[str, Any]", within(schema, ()))
 
 
-def _schema(kind: type[Struct], title: str) -> bytes:
-    return msgspec.json.encode({**inlined(msgspec.json.schema(kind)), "title": title})
+def _schema(type_: type[Struct], title: str) -> bytes:
+    return msgspec.json.encode({**inlined(msgspec.json.schema(type_)), "title": title})
 
 
-def _channel(topic: str, kind: type[Struct], name: str) -> Channel:
-    return Channel(topic, name, _schema(kind, name))
+def _channel(topic: str, type_: type[Struct], name: str) -> Channel:
+    return Channel(topic, name, _schema(type_, name))
 
 
 CALLS: Final = _channel("/calls", Call, "trade.Call")

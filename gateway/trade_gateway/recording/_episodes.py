@@ -9,7 +9,7 @@ import msgspec
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import LOCKS, JointStates, Lock, Locks
 from trade_gateway.recording._motion import gaps, motion_of
-from trade_gateway.recording._reader import Entry
+from trade_gateway.recording._reader import RecordedMessage
 from trade_gateway.recording._sources import within
 
 _decode: Final = msgspec.json.Decoder(Locks).decode
@@ -34,7 +34,7 @@ class Episode(NamedTuple):
     """For each frame, the state one frame later, as recordings contain no commands."""
 
 
-def locked(entries: Iterable[Entry], joints: Sequence[str]) -> list[Span]:
+def locked(entries: Iterable[RecordedMessage], joints: Sequence[str]) -> list[Span]:
     """The times of locks over any of the joints, each with the lock's purpose."""
     open_: dict[tuple[str, str], Span] = {}
     """By owner and purpose: a lock over several containers is one."""

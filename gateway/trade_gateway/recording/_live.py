@@ -40,8 +40,8 @@ class Live:
         Raises:
             ConfigurationError: the address cannot be used.
         """
-        self._notices = _Notices()
-        self._newcomers = _Newcomers()
+        self._notices = _ServerLog()
+        self._newcomers = _NewSubscriptions()
         self._context = foxglove.Context()
         self._channels: dict[str, tuple[Channel, foxglove.Channel]] = {}
         self._locks: Message | None = None
@@ -125,27 +125,27 @@ class Live:
         self.close()
 
 
-class _Newcomers(ServerListener):
+class _NewSubscriptions(ServerListener):
     """New subscriptions; a thread of the server adds them, ours takes them."""
 
     def __init__(self) -> None:
-        self._seen: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        self._seen.put((client.id, channel.topic))
+        self._queue.put((client.id, channel.topic))
 
     def take(self) -> Iterator[tuple[int, str]]:
         with suppress(queue.Empty):
             while True:
-                yield self._seen.get_nowait()
+                yield self._queue.get_nowait()
 
 
-class _Notices(logging.Handler):
+class _ServerLog(logging.Handler):
     """Collects the server's log, its only report on viewers that are slow or were rejected."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._seen: queue.Queue[str] = queue.Queue(_KEEP_NOTICES)
+        self._lines: queue.Queue[str] = queue.Queue(_KEEP_NOTICES)
         self.behind = 0
         logger = logging.getLogger(_LOGGER)
         logger.propagate = False
@@ -161,12 +161,12 @@ class _Notices(logging.Handler):
         elif record.levelno < logging.WARNING:
             return
         with suppress(queue.Full):
-            self._seen.put_nowait(text)
+            self._lines.put_nowait(text)
 
     def take(self) -> Iterator[str]:
         with suppress(queue.Empty):
             while True:
-                yield self._seen.get_nowait()
+                yield self._lines.get_nowait()
 
     def close(self) -> None:
         logging.getLogger(_LOGGER).removeHandler(self)

@@ -45,7 +45,7 @@ class Watch:
         """Begins of locks, by container, owner and the wall clock of that moment."""
         self._groups = groups
         self._wake = wake
-        self._seen: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._calls = _Calls(container, groups)
         self._locks: list[Lock] | None = None
         self._locks_at = 0.0
@@ -62,7 +62,7 @@ class Watch:
         """Yields the results since the last time, without their time of arrival."""
         with contextlib.suppress(queue.Empty):
             while True:
-                yield self._seen.get_nowait()
+                yield self._messages.get_nowait()
 
     def _run(self) -> None:
         while not self._end.is_set():
@@ -81,7 +81,7 @@ class Watch:
         self._wake.set()
 
     def _put(self, channel: Channel, stamp_s: float, value: object) -> None:
-        self._seen.put(Message(channel, 0, max(0, int(stamp_s * 1e9)), encoded(value)))
+        self._messages.put(Message(channel, 0, max(0, int(stamp_s * 1e9)), encoded(value)))
 
     def _look_at_calls(self) -> None:
         for span in self._calls.read():

@@ -16,7 +16,7 @@ _BROKEN: Final = (McapError, struct.error, ValueError, ZstdError)
 """What the library raises at an incomplete end of a file."""
 
 
-class Entry(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     topic: str
@@ -25,7 +25,7 @@ class Entry(NamedTuple):
     data: bytes
 
 
-def entries(path: Path) -> Iterator[Entry]:
+def entries(path: Path) -> Iterator[RecordedMessage]:
     """Yields the messages of a recording in their written order, up to an incomplete end.
 
     Raises:
@@ -39,7 +39,7 @@ def entries(path: Path) -> Iterator[Entry]:
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
-                    yield Entry(topics[record.channel_id], record.log_time, record.publish_time, record.data)
+                    yield RecordedMessage(topics[record.channel_id], record.log_time, record.publish_time, record.data)
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
 

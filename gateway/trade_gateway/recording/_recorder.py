@@ -15,7 +15,7 @@ from trade_gateway.process._signals import SignalEvent
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._poller import Watch
-from trade_gateway.recording._sources import Sources, Wanted
+from trade_gateway.recording._sources import RecordedParts, Sources
 from trade_gateway.recording._timeline import Timeline
 
 
@@ -25,7 +25,7 @@ class Ring:
     def __init__(self, keep_s: float, most_bytes: int) -> None:
         self._keep_ns = int(keep_s * 1e9)
         self._most_bytes = most_bytes
-        self._kept: deque[Message] = deque()
+        self._messages: deque[Message] = deque()
         self.size_bytes = 0
         """Size of the kept messages in bytes."""
         self.cut_short = 0
@@ -33,23 +33,23 @@ class Ring:
 
     def write(self, message: Message) -> None:
         """Adds a message, and drops what is too old or too much."""
-        self._kept.append(message)
+        self._messages.append(message)
         self.size_bytes += len(message.data)
-        while self._kept[0].arrived_ns < message.arrived_ns - self._keep_ns:
+        while self._messages[0].arrived_ns < message.arrived_ns - self._keep_ns:
             self._drop()
-        while self.size_bytes > self._most_bytes and len(self._kept) > 1:
+        while self.size_bytes > self._most_bytes and len(self._messages) > 1:
             self._drop()
             self.cut_short += 1
 
     def _drop(self) -> None:
-        self.size_bytes -= len(self._kept.popleft().data)
+        self.size_bytes -= len(self._messages.popleft().data)
 
     def save(self, path: Path, about: Mapping[str, str], attachments: Sequence[Attachment] = ()) -> int:
         """Writes the kept messages to a file, and keeps them; returns their number. Raises like the file."""
         with RecordingFile(path, about, attachments) as file:
-            for message in self._kept:
+            for message in self._messages:
                 file.write(message)
-        return len(self._kept)
+        return len(self._messages)
 
 
 _LOOK_S: Final = 0.5
@@ -66,7 +66,7 @@ class Sink(Protocol):
 class Recorder:
     """Records a system until its end is requested. Used by one thread; a context manager."""
 
-    def __init__(self, container: Container, wanted: Wanted, ending: threading.Event | SignalEvent) -> None:
+    def __init__(self, container: Container, wanted: RecordedParts, ending: threading.Event | SignalEvent) -> None:
         """Starts the subscriptions.
 
         Args:
@@ -149,7 +149,7 @@ class Recorder:
         self.close()
 
 
-def about(container: Container, wanted: Wanted) -> dict[str, str]:
+def about(container: Container, wanted: RecordedParts) -> dict[str, str]:
     """The metadata of a recording."""
     return {
         "system": container.settings.system,

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import CompressedImage, JointStates, RawImage, Time, group_of
-from trade_gateway.recording._reader import Entry, entries
+from trade_gateway.recording._reader import RecordedMessage, entries
 from trade_gateway.ros_messages._conversion import ros_path
 from trade_gateway.ros_messages._types import Message, Types
 
@@ -69,7 +69,9 @@ def _copy(writer: Writer, recording: Path, groups: Collection[str], name_of: Cal
     return dict(written)
 
 
-def _message(entry: Entry, groups: Collection[str], name_of: Callable[[str], str]) -> tuple[str, str, Message] | None:
+def _message(
+    entry: RecordedMessage, groups: Collection[str], name_of: Callable[[str], str]
+) -> tuple[str, str, Message] | None:
     """The topic, the type and the message for an entry; None: it has no counterpart in ROS."""
     group = group_of(entry.topic)
     if group is not None:
@@ -79,7 +81,7 @@ def _message(entry: Entry, groups: Collection[str], name_of: Callable[[str], str
     return None
 
 
-def _states(entry: Entry, name_of: Callable[[str], str]) -> Message:
+def _states(entry: RecordedMessage, name_of: Callable[[str], str]) -> Message:
     states = _joints(entry.data)
     return {
         "header": _header(Time.of(entry.stamp_ns), ""),
@@ -89,7 +91,7 @@ def _states(entry: Entry, name_of: Callable[[str], str]) -> Message:
     }
 
 
-def _picture(entry: Entry, topic: str) -> tuple[str, str, Message]:
+def _picture(entry: RecordedMessage, topic: str) -> tuple[str, str, Message]:
     try:
         raw = _raw(entry.data)
     except msgspec.ValidationError:

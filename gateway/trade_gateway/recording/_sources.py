@@ -29,7 +29,7 @@ _LIMITS_S: Final = 2.0
 Read = Callable[[Handle, Sample], Message]
 
 
-class Wanted(NamedTuple):
+class RecordedParts(NamedTuple):
     """The parts of a system to record."""
 
     groups: Sequence[str] = ()
@@ -49,10 +49,10 @@ class _Source(NamedTuple):
 class Sources:
     """The open streams. Used by one thread, which is woken when there are samples."""
 
-    def __init__(self, container: Container, wanted: Wanted, wake: threading.Event, timeline: Timeline) -> None:
+    def __init__(self, container: Container, wanted: RecordedParts, wake: threading.Event, timeline: Timeline) -> None:
         self._container = container
         self._timeline = timeline
-        self._wanted = wanted
+        self._parts = wanted
         self._wake = wake
         self._open: dict[Handle, _Source] = {}
         self._arms: dict[Handle, list[str]] = {}
@@ -85,7 +85,7 @@ class Sources:
         self._wake.set()
 
     def _meant(self) -> Iterator[tuple[Handle, float, Read]]:
-        wanted = self._wanted
+        wanted = self._parts
         readable = [
             handle
             for handle in self._container.services(~where(group="trade"))

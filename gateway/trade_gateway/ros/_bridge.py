@@ -20,7 +20,7 @@ from trade_gateway.ros.from_ros._actions import action_from_ros
 from trade_gateway.ros.from_ros._joints import joints_from_ros
 from trade_gateway.ros.from_ros._providers import Records
 from trade_gateway.ros.from_ros._services import (
-    Offered,
+    OfferedProvider,
     parameters_from_ros,
     publisher_from_ros,
     service_from_ros,
@@ -42,7 +42,7 @@ GROUP: Final = "ros"
 """Group of the bridge's own service."""
 
 
-class Bridged(Struct, frozen=True):
+class BridgeMappings(Struct, frozen=True):
     """What a bridge maps now."""
 
     to_ros: dict[str, str]
@@ -55,7 +55,7 @@ class Bridged(Struct, frozen=True):
     """Entries that are not mapped, and why."""
 
 
-publish("trade_gateway.ros", Bridged)
+publish("trade_gateway.ros", BridgeMappings)
 
 
 class Bridge:
@@ -76,7 +76,7 @@ class Bridge:
         self._container = container
         self._say = say
         self._leaving = ExitStack()
-        self._offered: list[Offered] = []
+        self._offered: list[OfferedProvider] = []
         with contextlib.ExitStack() as failing:
             failing.callback(self.close)
             container.register(self, GROUP)
@@ -108,7 +108,7 @@ class Bridge:
 
     def _offer(self, graph: Graph, file: RosFile) -> None:
         into, records = file.from_ros, Records(graph.types)
-        makes: list[Callable[[], Offered]] = [
+        makes: list[Callable[[], OfferedProvider]] = [
             *(partial(service_from_ros, entry, graph, records) for entry in into.service),
             *(partial(topic_from_ros, entry, graph, records) for entry in into.topic),
             *(partial(publisher_from_ros, entry, graph, records) for entry in into.publish),
@@ -127,10 +127,10 @@ class Bridge:
         return self._following.settled(timeout_s)
 
     @service(effect="read")
-    def bridged(self) -> Bridged:
+    def bridged(self) -> BridgeMappings:
         """The mapped entries, the nodes that use them, and the entries that are not mapped."""
         offered = {one.where: one.groups for one in self._offered}
-        return Bridged(self._following.opened(), offered, self._nodes.names(), self._following.problems())
+        return BridgeMappings(self._following.opened(), offered, self._nodes.names(), self._following.problems())
 
     def _heard(self, problem: str) -> None:
         """Handles the loss and the return of ROS."""

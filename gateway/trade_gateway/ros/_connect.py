@@ -12,7 +12,7 @@ from trade_gateway.ros_messages._conversion import ros_path
 from trade_gateway.ros_messages._types import Types, installed_definitions
 
 
-class _Side(NamedTuple):
+class _RosVersion(NamedTuple):
     module: str
     kind: str
     says: tuple[str, ...]
@@ -20,8 +20,8 @@ class _Side(NamedTuple):
 
 
 _SIDES: Final = {
-    1: _Side("trade_gateway.ros.ros1", "Ros1", ("master", "python", "ip")),
-    2: _Side("trade_gateway.ros.ros2", "Ros2", ("router", "domain_id")),
+    1: _RosVersion("trade_gateway.ros.ros1", "Ros1", ("master", "python", "ip")),
+    2: _RosVersion("trade_gateway.ros.ros2", "Ros2", ("router", "domain_id")),
 }
 
 

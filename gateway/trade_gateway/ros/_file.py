@@ -56,14 +56,14 @@ class Link(_Strict, frozen=True, kw_only=True):
 # --- to ROS
 
 
-class _Of(_Strict, frozen=True, kw_only=True):
+class _ServiceChoice(_Strict, frozen=True, kw_only=True):
     group: str = ""
     """All services of this group and of the groups beneath it."""
     service: str = ""
     """One service instead: ``rosie.head.stop``."""
 
 
-class ServiceEntry(_Of, frozen=True, kw_only=True):
+class ServiceEntry(_ServiceChoice, frozen=True, kw_only=True):
     """``[[to_ros.service]]``: TRADE services as ROS services."""
 
     type: _Type
@@ -200,14 +200,14 @@ class ToRos(_Strict, frozen=True, kw_only=True):
 # --- from ROS
 
 
-class _Offered(_Strict, frozen=True, kw_only=True):
+class _OfferedGroups(_Strict, frozen=True, kw_only=True):
     groups: Annotated[list[_Text], Meta(min_length=1)]
     """Groups in which it is offered; access rules apply to the first one."""
     name: str = ""
     """Name of the TRADE service; by default the last part of the ROS name."""
 
 
-class FromService(_Offered, frozen=True, kw_only=True):
+class FromService(_OfferedGroups, frozen=True, kw_only=True):
     """``[[from_ros.service]]``: a ROS service as a TRADE service."""
 
     service: _RosName
@@ -220,7 +220,7 @@ class FromService(_Offered, frozen=True, kw_only=True):
     deadline_s: _Seconds = 10.0
 
 
-class FromTopic(_Offered, frozen=True, kw_only=True):
+class FromTopic(_OfferedGroups, frozen=True, kw_only=True):
     """``[[from_ros.topic]]``: the latest message of a ROS topic as a TRADE service that reads."""
 
     topic: _RosName
@@ -230,7 +230,7 @@ class FromTopic(_Offered, frozen=True, kw_only=True):
     """Whether the publisher keeps the last message, e.g. a map, for later subscribers. Its age is then not checked."""
 
 
-class FromPublish(_Offered, frozen=True, kw_only=True):
+class FromPublish(_OfferedGroups, frozen=True, kw_only=True):
     """``[[from_ros.publish]]``: a TRADE service that publishes."""
 
     topic: _RosName
@@ -243,7 +243,7 @@ class FromPublish(_Offered, frozen=True, kw_only=True):
     itself, and ``stop`` is published when its session ends."""
 
 
-class FromAction(_Offered, frozen=True, kw_only=True):
+class FromAction(_OfferedGroups, frozen=True, kw_only=True):
     """``[[from_ros.action]]``: an action of ROS as a TRADE service with progress, a result and a stop."""
 
     action: _RosName

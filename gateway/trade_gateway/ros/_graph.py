@@ -47,7 +47,7 @@ class RosRefused(CallerError):
         return f"{self.what}: {self.problem}"
 
 
-class Ended(Enum):
+class GoalEnd(Enum):
     """How a goal of an action ended."""
 
     SUCCEEDED = "succeeded"
@@ -59,12 +59,12 @@ class Ended(Enum):
 class Outcome:
     """The end of a goal."""
 
-    how: Ended
+    how: GoalEnd
     result: Message
     text: str = ""
 
 
-class Closes(Protocol):
+class Closable(Protocol):
     """Something open that can be closed."""
 
     def close(self) -> None:
@@ -72,7 +72,7 @@ class Closes(Protocol):
         ...
 
 
-class Publisher(Closes, Protocol):
+class Publisher(Closable, Protocol):
     """A published topic."""
 
     def send(self, message: Mapping[str, Any]) -> None:
@@ -110,7 +110,7 @@ Refuse = Callable[[Message], Outcome | None]
 it, ROS 2 only that it was rejected."""
 
 
-class Pursuit(Protocol):
+class ActionGoal(Protocol):
     """A goal that TRADE sent to an action of ROS."""
 
     def wait(self, timeout_s: float) -> Outcome:
@@ -137,14 +137,14 @@ class Graph(Protocol):
         """Publishes a topic; latched: later subscribers receive the last message."""
         ...
 
-    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closable:
         """Subscribes to a topic; latched: also receives earlier messages, if the publisher keeps them.
 
         Otherwise earlier messages are dropped: an old command would be taken for a new one.
         """
         ...
 
-    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closable:
         """Serves a service; with ``stops``, each request is answered at once, on its own thread, without a queue."""
         ...
 
@@ -159,7 +159,7 @@ class Graph(Protocol):
         """
         ...
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closable:
         """Serves an action; each goal has its own thread, and a later one cancels the one before.
 
         Args:
@@ -172,7 +172,7 @@ class Graph(Protocol):
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
-    ) -> Pursuit:
+    ) -> ActionGoal:
         """Sends a goal to a ROS action. Raises RosUnreachable: no node serves it."""
         ...
 
@@ -184,7 +184,7 @@ class Graph(Protocol):
         """Sets a parameter. Raises RosUnreachable, RosRefused."""
         ...
 
-    def watch_nodes(self, listener: NodeListener) -> Closes:
+    def watch_nodes(self, listener: NodeListener) -> Closable:
         """Reports nodes that come and go, the present ones first. A node that dies is reported within seconds."""
         ...
 

@@ -12,7 +12,7 @@ LIMBS: Final = where(kind="JointGroup") | where(kind="Arm") | where(kind="Motor"
 _LIMITS_S: Final = 5.0
 
 
-class Measured(NamedTuple):
+class JointMeasurement(NamedTuple):
     """Positions of joints in rad and rad/s, in the order of their names; of a gripper, its width in m and m/s."""
 
     names: Sequence[str]
@@ -54,17 +54,17 @@ def joints_of(container: Container, handle: Handle) -> list[str]:
     return [one["name"] for one in cast("list[dict[str, Any]]", limits)]
 
 
-def measured(joints: Sequence[str], state: Any) -> Measured:
+def measured(joints: Sequence[str], state: Any) -> JointMeasurement:
     """Reads the positions from the state of a motor, joint group, arm or gripper."""
     plain: Any = msgspec.to_builtins(state)
     if isinstance(plain, dict) and "positions_rad" in plain:
         arm = cast("dict[str, Any]", plain)
-        return Measured(joints, arm["positions_rad"], arm["velocities_rad_s"], arm["age_s"])
+        return JointMeasurement(joints, arm["positions_rad"], arm["velocities_rad_s"], arm["age_s"])
     if isinstance(plain, dict) and "width_m" in plain:
         hand = cast("dict[str, Any]", plain)
-        return Measured(joints, [hand["width_m"]], [hand["speed_m_s"]], hand["age_s"], is_width=True)
+        return JointMeasurement(joints, [hand["width_m"]], [hand["speed_m_s"]], hand["age_s"], is_width=True)
     motors = cast("list[dict[str, Any]]", plain if isinstance(plain, list) else [plain])
-    return Measured(
+    return JointMeasurement(
         [motor["name"] for motor in motors],
         [motor["position_rad"] for motor in motors],
         [motor["velocity_rad_s"] for motor in motors],

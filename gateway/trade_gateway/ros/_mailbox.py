@@ -36,7 +36,7 @@ class Mailbox(Generic[_T]):
         end_s: how long closing waits for running callbacks, in seconds.
         """
         self._tell = callback
-        self._most = most
+        self._capacity = most
         self._end_s = end_s
         self._longest_s = longest_s
         self._drop = drop
@@ -54,7 +54,7 @@ class Mailbox(Generic[_T]):
                 dropped.append(item)
             else:
                 self._waiting.append((time.monotonic(), item))
-                if self._most is not None and len(self._waiting) > self._most:
+                if self._capacity is not None and len(self._waiting) > self._capacity:
                     dropped.append(self._waiting.popleft()[1])
                 self._changed.notify()
         self._leave(dropped)
@@ -104,7 +104,7 @@ class AtOnce(Generic[_T]):
         """
         self._name = name
         self._tell = callback
-        self._most = most
+        self._limit = most
         self._drop = drop
         self._waiting: deque[_T] = deque()
         self._threads: set[threading.Thread] = set()
@@ -116,7 +116,7 @@ class AtOnce(Generic[_T]):
         thread = threading.Thread(target=self._run, args=(item,), name=self._name, daemon=True)
         with self._changed:
             closed = self._closed
-            at_once = not closed and len(self._threads) < self._most
+            at_once = not closed and len(self._threads) < self._limit
             if at_once:
                 self._threads.add(thread)
             elif not closed:

@@ -8,7 +8,7 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 from trade import Constraint, Container, Handle, where
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Closes
+from trade_gateway.ros._graph import Closable
 from trade_gateway.ros_messages._conversion import failure
 
 _logger = logging.getLogger("trade")
@@ -49,7 +49,7 @@ class Mapping(Protocol):
         """Pairs of places and services. Raises ConfigurationError: the selection is ambiguous."""
         ...
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         """Opens the mapping. Raises ConfigurationError: the types do not match."""
         ...
 
@@ -78,7 +78,7 @@ class Following:
         self._container = container
         self._mappings = mappings
         self._say = say
-        self._open: dict[_Key, Closes] = {}
+        self._open: dict[_Key, Closable] = {}
         self._failed: dict[tuple[int, Place | None, Handle | None], tuple[str, float]] = {}
         """The reason and the time of each failure, by mapping."""
         self._absent: dict[int, float] = {}
@@ -86,7 +86,7 @@ class Following:
         self._look_now = threading.Event()
         self._closing = False
         self._first = threading.Event()
-        news = _Heard(self._look_now.set)
+        news = _ServiceChanges(self._look_now.set)
         self._notifications = [ask(where(), news.came) for ask in (container.joined, container.left, container.changed)]
         self._thread = threading.Thread(target=self._follow, name="trade-ros-following", daemon=True)
         self._thread.start()
@@ -191,7 +191,7 @@ class Following:
             self._open.pop(key).close()
 
 
-class _Heard:
+class _ServiceChanges:
     """Receives notifications of services that come, go and change."""
 
     target_text = "update the mappings to ROS (the ROS bridge)"

@@ -94,13 +94,13 @@ _LATE_S: Final = 5.0
 """Time after a call's deadline by which its end must be known."""
 
 
-class Guest:
+class NodeClient:
     """The client that represents one ROS node; its methods wait."""
 
-    def __init__(self, container: Container, client: Client, who: str) -> None:
+    def __init__(self, container: Container, client: Client, node_name: str) -> None:
         self._container = container
         self.client: Final = client
-        self.who: Final = who
+        self.who: Final = node_name
         """Its name; empty if unknown."""
         self.grips: Final = NodeLocks(container, client)
         self.heard_at = time.monotonic()
@@ -187,7 +187,7 @@ class Nodes:
         self._graph = graph
         self._grace_s = grace_s
         self._tell = changed
-        self._guests: dict[str, Guest] = {}
+        self._guests: dict[str, NodeClient] = {}
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}
         """When recently ended nodes ended."""
@@ -199,7 +199,7 @@ class Nodes:
         self._thread = threading.Thread(target=self._look_on, name="trade-ros-nodes", daemon=True)
         self._thread.start()
 
-    def guest(self, client: str, came_at: float, *, stops: bool = False) -> Guest:
+    def guest(self, client: str, came_at: float, *, stops: bool = False) -> NodeClient:
         """Returns the client that represents a node.
 
         Args:
@@ -230,9 +230,9 @@ class Nodes:
             return False
         return came_at <= gone_at or (client not in self._there and time.monotonic() - gone_at < _FORGOTTEN_S)
 
-    def _opened(self, client: str) -> Guest:
+    def _opened(self, client: str) -> NodeClient:
         session = self._container.open_session(client.strip("/") or "unknown")
-        return Guest(self._container, Client(self._container.address.identity, session, lambda _: None), client)
+        return NodeClient(self._container, Client(self._container.address.identity, session, lambda _: None), client)
 
     def names(self) -> list[str]:
         """Names of the nodes that have a session now."""
@@ -274,7 +274,7 @@ class Nodes:
         if changed:
             self._tell(lost)
 
-    def _unseen(self, guest: Guest, now: float) -> bool:
+    def _unseen(self, guest: NodeClient, now: float) -> bool:
         unseen = bool(self._lost) or guest.who not in (UNKNOWN, *self._there)
         return unseen and now - guest.heard_at > _UNSEEN_S
 

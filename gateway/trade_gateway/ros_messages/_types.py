@@ -165,16 +165,16 @@ class Types:
             return np.frombuffer(given, dtype=np.uint8)
         return np.array([self._put_one(field.type, one) for one in given], dtype=_dtype(field.type))
 
-    def _put_one(self, kind: str, value: Any) -> Any:
-        if "/" in kind:
-            return self.object(kind, {} if value is None else value)
-        if kind in _TEXTS:
+    def _put_one(self, type_: str, value: Any) -> Any:
+        if "/" in type_:
+            return self.object(type_, {} if value is None else value)
+        if type_ in _TEXTS:
             return "" if value is None else _text(value)
-        if kind == "bool":
+        if type_ == "bool":
             return bool(value)
-        if kind.startswith("float"):
+        if type_.startswith("float"):
             return 0.0 if value is None else float(value)
-        return 0 if value is None else _whole(kind, value)
+        return 0 if value is None else _whole(type_, value)
 
     def _take(self, field: Field, value: Any) -> Any:
         if not field.many:
@@ -238,8 +238,8 @@ class Types:
             if path.suffix[1:] == kind and kind in ("msg", *_PARTS):
                 self._add(path, f"{package}/{kind}/{path.stem}", kind)
 
-    def _add(self, path: Path, type_name: str, kind: str) -> None:
-        names = [f"{type_name}_{part}" for part in _PARTS.get(kind, ())]
+    def _add(self, path: Path, type_name: str, type_: str) -> None:
+        names = [f"{type_name}_{part}" for part in _PARTS.get(type_, ())]
         try:
             whole = read_text(path)
         except (OSError, UnicodeDecodeError) as bad:
@@ -252,7 +252,7 @@ class Types:
                 if name not in self._store.fielddefs:
                     # the library puts all types below msg; in ROS 2 the name is part of the hash
                     ((_, read),) = get_types_from_msg(
-                        text or _nothing(self.ros), name.replace(f"/{kind}/", "/msg/")
+                        text or _nothing(self.ros), name.replace(f"/{type_}/", "/msg/")
                     ).items()
                     self._store.register({name: read})
         except TypesysError as error:
@@ -276,8 +276,8 @@ def _sections(text: str) -> list[str]:
     return ["\n".join(lines) + "\n" for lines in parts]
 
 
-def _field(name: str, kind: Any) -> Field:
-    match kind:
+def _field(name: str, type_: Any) -> Field:
+    match type_:
         case (Nodetype.BASE, (base, _)):
             return Field(name, base, many=False, length=0)
         case (Nodetype.NAME, other):
@@ -287,18 +287,18 @@ def _field(name: str, kind: Any) -> Field:
         case (_, (inner, _)):
             return Field(name, _field(name, inner).type, many=True, length=0)
         case _:
-            raise ConfigurationError(where=name, problem=f"has an unknown kind: {kind!r}")
+            raise ConfigurationError(where=name, problem=f"has an unknown kind: {type_!r}")
 
 
-def _dtype(kind: str) -> Any:
-    return np.dtype("uint8" if kind in _OCTETS else kind)
+def _dtype(type_: str) -> Any:
+    return np.dtype("uint8" if type_ in _OCTETS else type_)
 
 
-def _whole(kind: str, value: Any) -> int:
+def _whole(type_: str, value: Any) -> int:
     if isinstance(value, float) and not value.is_integer():
         raise ValueError("it is not a whole number")
     number = int(value)
-    limits = np.iinfo(_dtype(kind))
+    limits = np.iinfo(_dtype(type_))
     if not limits.min <= number <= limits.max:
         raise ValueError(f"it must be from {limits.min} to {limits.max}")
     return number

@@ -30,7 +30,7 @@ class _Guest:
         self._leaving.close()
 
 
-class Guests:
+class SystemGuests:
     """The guests in all other systems that a gateway file names."""
 
     def __init__(self) -> None:

@@ -89,22 +89,22 @@ class TypeWriter:
             number += 1
             name = f"{wanted}{number}"
 
-    def _text(self, kind: Any, *, given: bool) -> str:
-        if kind is Any:
+    def _text(self, type_: Any, *, given: bool) -> str:
+        if type_ is Any:
             return self.name("typing", "Any")
-        if kind is None or kind is type(None):
+        if type_ is None or type_ is type(None):
             return "None"
-        origin, inner = get_origin(kind), get_args(kind)
+        origin, inner = get_origin(type_), get_args(type_)
         if origin in (Union, types.UnionType):
             return " | ".join(dict.fromkeys(self._text(one, given=given) for one in inner))
         if origin is Literal:
             return self._literal(inner)
         if origin is not None:
             return self._generic(origin, inner, given=given)
-        if issubclass(kind, msgspec.Struct):
-            record = self._record(kind)
+        if issubclass(type_, msgspec.Struct):
+            record = self._record(type_)
             return f"{record} | {self._text(dict[str, Any], given=True)}" if given else record
-        return self.name(kind.__module__, kind.__name__)
+        return self.name(type_.__module__, type_.__name__)
 
     def _literal(self, values: Sequence[Any]) -> str:
         if not all(isinstance(value, _LITERALS) for value in values):
@@ -119,16 +119,16 @@ class TypeWriter:
         wide = _GIVEN[origin]
         return f"{self.name('collections.abc', wide.__name__)}[{', '.join(text for text in texts if text != '...')}]"
 
-    def _record(self, kind: type[msgspec.Struct]) -> str:
+    def _record(self, type_: type[msgspec.Struct]) -> str:
         """A class with the attributes of a record."""
         lines: list[str] = []
-        for field in msgspec.structs.fields(kind):
+        for field in msgspec.structs.fields(type_):
             if not is_member(field.name):
                 continue
             self.members.add(field.name)
             lines.append(f"    @{self.name('builtins', 'property')}")
             lines.append(f"    def {field.name}(self) -> {self._text(field.type, given=False)}: ...")
-        return self.add_class(kind.__name__, lines or ["    ..."])
+        return self.add_class(type_.__name__, lines or ["    ..."])
 
 
 def is_member(name: str) -> bool:

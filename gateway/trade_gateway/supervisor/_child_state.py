@@ -10,7 +10,7 @@ from trade_gateway.process._kill_timer import TimerLease, uptime_s
 from trade_gateway.supervisor._lease_protocol import LeaseEnd
 from trade_gateway.supervisor._objects import CreatedObjects
 from trade_gateway.supervisor._process import Process
-from trade_gateway.supervisor._restart_policy import Life, State
+from trade_gateway.supervisor._restart_policy import ChildLife, State
 
 
 class ChildInfo(Struct, frozen=True):
@@ -46,7 +46,7 @@ class Unit:
     def __init__(self, child: Child, grace_s: float, clock: Callable[[], float]) -> None:
         self.child = child
         self._clock = clock
-        self.life = Life(child.terms, grace_s=grace_s)
+        self.life = ChildLife(child.terms, grace_s=grace_s)
         self.process: Process | None = None
         self.boot = 0
         """Counts processes, so that reports about an earlier one are ignored."""

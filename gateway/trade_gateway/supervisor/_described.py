@@ -9,7 +9,7 @@ import msgspec
 import tomlkit
 from msgspec import Struct
 
-from trade_gateway.config._entry import Entry
+from trade_gateway.config._entry import ContainerTable
 from trade_gateway.config._gateway_file import Plan
 from trade_gateway.config._kind import PRODUCTS, kind_of_product
 
@@ -45,7 +45,7 @@ class Difference(Struct, frozen=True, kw_only=True):
     """What runs."""
 
 
-def absolute(entry: Entry, beside: Path) -> dict[str, Any]:
+def absolute(entry: ContainerTable, beside: Path) -> dict[str, Any]:
     """Returns a table as plain data that means the same in a file of any other folder."""
     table = cast("dict[str, Any]", msgspec.to_builtins(entry))
     for key in _PATHS:

@@ -58,7 +58,7 @@ class _After(enum.Enum):
 _ALIVE: Final = frozenset((State.STARTING, State.UP, State.SILENT, State.STOPPING))
 
 
-class Life:
+class ChildLife:
     """The life of one child. Times are seconds of a monotonic clock.
 
     Args:

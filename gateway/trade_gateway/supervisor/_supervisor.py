@@ -68,7 +68,7 @@ class Supervisor:
         self._grace_s = grace_s
         self._store = StateStore(folder / f"{container().name}.state.sqlite", self._complain)
         self._units: dict[str, Unit] = {}
-        self._shown: tuple[ChildInfo, ...] = ()
+        self._child_infos: tuple[ChildInfo, ...] = ()
         self._inbox: deque[Callable[[], None]] = deque()
         self._jobs: set[threading.Thread] = set()
         self._closing = False
@@ -98,18 +98,18 @@ class Supervisor:
 
     def children(self) -> list[ChildInfo]:
         """Returns their states."""
-        return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]
+        return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._child_infos]
 
     def restart(self, name: str, requester: str) -> bool:
         """Restarts a child, also if it was given up; returns whether the name is known."""
-        if all(info.name != name for info in self._shown):
+        if all(info.name != name for info in self._child_infos):
             return False
         self._post(partial(self._restart, name, requester))
         return True
 
     def stop(self, name: str, requester: str) -> bool:
         """Ends a child until it is restarted by request; returns whether the name is known."""
-        if all(info.name != name for info in self._shown):
+        if all(info.name != name for info in self._child_infos):
             return False
         self._post(partial(self._stop, name, requester))
         return True
@@ -158,7 +158,7 @@ class Supervisor:
                 self._inbox.popleft()()
             for unit in list(self._units.values()):
                 self._look(unit, self._clock())
-            self._shown = tuple(unit.info() for unit in self._units.values())
+            self._child_infos = tuple(unit.info() for unit in self._units.values())
 
     def _drain_wake_pipe(self) -> None:
         with contextlib.suppress(BlockingIOError):

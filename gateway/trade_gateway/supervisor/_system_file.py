@@ -12,7 +12,7 @@ from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade_gateway.config._children import Supervised
-from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
+from trade_gateway.config._entry import ContainerSpec, ContainerTable, FileDefaults
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._supervised_system import is_supervised
 from trade_gateway.config._tables import Tables, converted, read_entry
@@ -75,7 +75,7 @@ def read_system_file(path: Path) -> SystemPlan:
     named = cast("dict[str, object]", tables)
     supervised = {name for name, table in named.items() if system.supervisor and is_supervised(table)}
     entries = {
-        name: read_entry(table, Supervised if name in supervised else Entry, path, text, ("container", name))
+        name: read_entry(table, Supervised if name in supervised else ContainerTable, path, text, ("container", name))
         for name, table in named.items()
     }
     defaults = FileDefaults(
@@ -93,7 +93,7 @@ def _keeper(path: Path, text: str, system: _System, supervised: Collection[str])
     if not supervised or system.supervisor in supervised:
         problem = "it has the name of a container" if supervised else "no container of this host is for it to supervise"
         raise ConfigurationError(where=at(path, text, ("system",), "supervisor"), problem=problem)
-    entry = Entry(gateway=str(path.absolute()))
+    entry = ContainerTable(gateway=str(path.absolute()))
     read_gateway_file(path)  # checks what only a supervisor asks for
     return ContainerSpec(system.supervisor, entry, ["--system", system.name, "gateway", entry.gateway], {})
 
@@ -115,12 +115,17 @@ class _WithGateways(Tables):
     """Tables of a system file, where a container may be a gateway."""
 
     def __init__(
-        self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, Entry], supervised: Collection[str]
+        self,
+        path: Path,
+        text: str,
+        defaults: FileDefaults,
+        entries: Mapping[str, ContainerTable],
+        supervised: Collection[str],
     ) -> None:
         super().__init__(path, text, defaults, entries)
         self._supervised = supervised
 
-    def check_kind(self, name: str, entry: Entry) -> None:
+    def check_kind(self, name: str, entry: ContainerTable) -> None:
         super().check_kind(name, entry)
         if entry.program is not None and name not in self._supervised:
             self.refuse(name, "program", 'only a supervisor starts programs; write supervisor = "keeper" in [system]')
@@ -131,7 +136,7 @@ class _WithGateways(Tables):
             if getattr(entry, key):
                 self.refuse(name, key, "is set in the gateway file; leave it out")
 
-    def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+    def check_here(self, name: str, entry: ContainerTable, environment: Mapping[str, str]) -> None:
         if not entry.gateway:
             super().check_here(name, entry, environment)
             return

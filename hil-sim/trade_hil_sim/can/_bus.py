@@ -12,7 +12,7 @@ import msgspec
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.mechanics._truth import BusState
 from trade_hil_sim.robot._bus_thread import BusThread
 
@@ -293,12 +293,12 @@ class CanBus(BusThread):
             self._note("overrun", t, source=client.name, detail="the client does not read; frames for it are lost")
 
     def _note(self, name: str, t: float, *, source: str = "", device_id: int | None = None, detail: str = "") -> None:
-        self.log.add(Entry(t, self.name, "event", name, device_id, source=source, detail=detail))
+        self.log.add(LogEntry(t, self.name, "event", name, device_id, source=source, detail=detail))
 
     def _frame(self, name: str, sender: Station, frame: Frame, t: float) -> None:
         """A frame that got through has its own name; one that did not is an event."""
         label, node = self.label(frame)
-        entry = Entry(
+        entry = LogEntry(
             t,
             self.name,
             "event" if name else "frame",

@@ -6,7 +6,7 @@ from math import inf, remainder, tau
 from typing import Protocol
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 from trade_hil_sim.mechanics._device import Emit, JointModel
 from trade_hil_sim.mechanics._shaft import Shaft
 from trade_hil_sim.mechanics._truth import DeviceState
@@ -179,7 +179,7 @@ class JointDevice(JointModel):
         position_counts: int | None = None,
     ) -> None:
         """Log an instruction that is carried out."""
-        entry = Entry(
+        entry = LogEntry(
             t,
             "",
             "instruction",

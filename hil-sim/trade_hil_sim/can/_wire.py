@@ -20,7 +20,7 @@ UNHEARD: Final = 10
 """How many unacknowledged frames a sender keeps: the usual length of a transmit queue on Linux."""
 
 
-class _Waiting(NamedTuple):
+class _QueuedFrame(NamedTuple):
     ready: float
     order: int
     frame: Frame
@@ -42,7 +42,7 @@ class Station:
         """Bus-off: after too many errors it neither sends nor receives."""
         self.errors = 0
         """Transmit error counter."""
-        self.queue: list[_Waiting] = []
+        self.queue: list[_QueuedFrame] = []
 
     @property
     def hears(self) -> bool:
@@ -88,7 +88,7 @@ class Wire:
         self._stations: list[Station] = []
         self._order = 0
         self._free_at = 0.0
-        self._under_way: tuple[Station, _Waiting, float] | None = None
+        self._under_way: tuple[Station, _QueuedFrame, float] | None = None
         self.busy_s = 0.0
         """How long frames have held the wire, in all."""
 
@@ -111,7 +111,7 @@ class Wire:
             self._referee.lost(station, frame, ready)
             return
         self._order += 1
-        heapq.heappush(station.queue, _Waiting(ready, self._order, frame))
+        heapq.heappush(station.queue, _QueuedFrame(ready, self._order, frame))
 
     def next_due(self) -> float:
         """When `advance` should be called next; infinity while nothing is to be sent."""
@@ -144,7 +144,7 @@ class Wire:
         self.busy_s += lasts_s
         self._under_way = winner, waiting, t + lasts_s
 
-    def _end(self, sender: Station, waiting: _Waiting, t: float) -> None:
+    def _end(self, sender: Station, waiting: _QueuedFrame, t: float) -> None:
         self._under_way, self._free_at = None, t
         if not sender.hears:
             return
@@ -157,7 +157,7 @@ class Wire:
             if station is not sender and station.hears:
                 station.deliver(waiting.frame, t)
 
-    def _destroy(self, sender: Station, waiting: _Waiting, t: float) -> None:
+    def _destroy(self, sender: Station, waiting: _QueuedFrame, t: float) -> None:
         """The sender tries again, until it has made too many errors."""
         self._free_at = t + ERROR_BITS * self._bit_s
         sender.errors += PER_ERROR

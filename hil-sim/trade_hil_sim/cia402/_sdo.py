@@ -30,16 +30,16 @@ class SdoServer:
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self._address = (0, 0)
-        self._rest: bytes | None = None
+        self._unsent: bytes | None = None
         """Bytes still to be uploaded."""
-        self._taken: bytearray | None = None
+        self._received: bytearray | None = None
         """Bytes downloaded so far."""
         self._size: int | None = None
         self._toggle = 0
 
     def reset(self) -> None:
         """Discard a transfer that is under way."""
-        self._rest = self._taken = None
+        self._unsent = self._received = None
 
     def answer(self, request: bytes, t: float) -> bytes | None:
         """The answer to a request, if there is one."""
@@ -80,18 +80,18 @@ class SdoServer:
             self._size = int.from_bytes(request[4:], "little") if sized else None
             if self._size is not None and self._size > LONGEST:
                 raise Abort(AbortCode.TOO_LONG)
-            self._taken, self._toggle = bytearray(), 0
+            self._received, self._toggle = bytearray(), 0
         return self._head(0x60) + bytes(4)
 
     def _download_segment(self, request: bytes, t: float) -> bytes:
-        if self._taken is None:
+        if self._received is None:
             raise Abort(AbortCode.UNKNOWN_COMMAND)
         toggle = self._next_toggle(request)
-        self._taken += request[1 : 1 + SEGMENT - (request[0] >> 1 & 7)]
-        if len(self._taken) > LONGEST:
+        self._received += request[1 : 1 + SEGMENT - (request[0] >> 1 & 7)]
+        if len(self._received) > LONGEST:
             raise Abort(AbortCode.TOO_LONG)
         if request[0] & 1:
-            data, self._taken = bytes(self._taken), None
+            data, self._received = bytes(self._received), None
             if self._size is not None and len(data) != self._size:
                 raise Abort(AbortCode.LENGTH)
             self._dictionary.write(*self._address, data, t)
@@ -103,17 +103,17 @@ class SdoServer:
         data = self._dictionary.read(*self._address, t)
         if 0 < len(data) <= EXPEDITED:
             return self._head(0x43 | EXPEDITED - len(data) << 2) + data.ljust(EXPEDITED, b"\0")
-        self._rest, self._toggle = data, 0
+        self._unsent, self._toggle = data, 0
         return self._head(0x41) + len(data).to_bytes(4, "little")
 
     def _upload_segment(self, request: bytes) -> bytes:
-        if self._rest is None:
+        if self._unsent is None:
             raise Abort(AbortCode.UNKNOWN_COMMAND)
         toggle = self._next_toggle(request)
-        piece, self._rest = self._rest[:SEGMENT], self._rest[SEGMENT:]
-        last = not self._rest
+        piece, self._unsent = self._unsent[:SEGMENT], self._unsent[SEGMENT:]
+        last = not self._unsent
         if last:
-            self._rest = None
+            self._unsent = None
         return bytes([toggle << 4 | SEGMENT - len(piece) << 1 | last]) + piece.ljust(SEGMENT, b"\0")
 
     def _next_toggle(self, request: bytes) -> int:

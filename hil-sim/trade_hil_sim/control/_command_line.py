@@ -35,9 +35,9 @@ def listing() -> str:
     return "".join(f"  {name:<15} {_described(kind)}\n" for name, kind in sorted(_KINDS.items()))
 
 
-def _described(kind: type[msgspec.Struct]) -> str:
-    keys = " ".join(key for key in kind.__struct_fields__ if key != "bus")
-    summary = (inspect.getdoc(kind) or "").splitlines()[0].replace("`", "")
+def _described(type_: type[msgspec.Struct]) -> str:
+    keys = " ".join(key for key in type_.__struct_fields__ if key != "bus")
+    summary = (inspect.getdoc(type_) or "").splitlines()[0].replace("`", "")
     return f"{summary} [{keys}]" if keys else summary
 
 

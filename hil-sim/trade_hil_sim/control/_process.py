@@ -16,7 +16,7 @@ import msgspec
 
 from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 from trade_hil_sim.log._queries import read_log
 from trade_hil_sim.robot._bus_thread import ready
 
@@ -148,7 +148,7 @@ class SimProcess:
         """Its process id."""
         return self._process.pid
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LogEntry]:
         """The byte log so far."""
         return read_log(self.log_path)
 

@@ -32,7 +32,7 @@ class State(msgspec.Struct, frozen=True, tag_field="do", tag="state", forbid_unk
     """Ask for the truth about all devices."""
 
 
-class _Named(msgspec.Struct):
+class _CommandName(msgspec.Struct):
     do: str
 
 
@@ -192,6 +192,6 @@ def _explain(problem: Exception, line: bytes) -> str:
     if "$.do" in text or "`do`" in text:
         return f"{text}; do is one of {', '.join(kinds)}"
     with suppress(*_UNREADABLE, KeyError):
-        kind = kinds[msgspec.json.decode(line, type=_Named).do]
+        kind = kinds[msgspec.json.decode(line, type=_CommandName).do]
         return f"{text}; its keys are do, {', '.join(kind.__struct_fields__)}"
     return f'{text}; a command is one line such as {{"do": "mute", "ids": [1]}}'

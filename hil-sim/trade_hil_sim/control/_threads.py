@@ -10,7 +10,7 @@ import msgspec
 from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.control._server import Answer, ControlServer, State
 from trade_hil_sim.faults._commands import Command, SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.robot._robot import buses_of
 from trade_robotfile import load
 
@@ -71,7 +71,7 @@ class SimThreads:
             raise SimulationError("this simulator keeps its log in memory; name a file with log=")
         return self._file
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LogEntry]:
         """The byte log so far."""
         return self._log.entries
 

@@ -2,7 +2,7 @@
 
 from functools import cached_property
 
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 from trade_hil_sim.serial._packets import BROADCAST, Writing
 from trade_hil_sim.serial._servo_bus import ServoBus
 from trade_robotfile import Joint
@@ -60,7 +60,7 @@ class DynamixelBus(ServoBus[Servo, Packet]):
     def _note(self, packet: Packet, t: float) -> None:
         if not packet.intact:
             name = f"damaged {packet.name}"
-            self.log.add(Entry(t, self.name, "instruction", name, packet.device_id, hex=packet.params.hex()))
+            self.log.add(LogEntry(t, self.name, "instruction", name, packet.device_id, hex=packet.params.hex()))
         elif packet.instruction == Instruction.ACTION:
             self._note_action(packet, t)
         else:
@@ -70,4 +70,6 @@ class DynamixelBus(ServoBus[Servo, Packet]):
         kept = [(servo, servo.registered) for servo in self._addressed(packet.device_id)]
         registers = self._touched((servo, Writing(servo.device_id, *write)) for servo, write in kept if write)
         moves = bool(MOTION & set(registers))
-        self.log.add(Entry(t, self.name, "instruction", "action", packet.device_id, registers=registers, moves=moves))
+        self.log.add(
+            LogEntry(t, self.name, "instruction", "action", packet.device_id, registers=registers, moves=moves)
+        )

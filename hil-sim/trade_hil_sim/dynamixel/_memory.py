@@ -56,7 +56,7 @@ class ControlTable(Memory[Register]):
             Refusal: access error past the end, and where there is no register at all.
         """
         end = address + length
-        if length == 0 or end > self.model.ends or not any(self._at[address:end]):
+        if length == 0 or end > self.model.ends or not any(self._by_address[address:end]):
             raise Refusal(ErrorCode.ACCESS, f"nothing to read at {address}, {length} bytes")
         return bytes(self._bytes[self._target(at)] for at in range(address, end))
 
@@ -81,7 +81,7 @@ class ControlTable(Memory[Register]):
     def _whole(self, bytes_at: dict[int, int]) -> list[Register]:
         registers: dict[Register, None] = {}
         for at in bytes_at:
-            register = self._at[at]
+            register = self._by_address[at]
             if register is None:
                 raise Refusal(ErrorCode.ACCESS, f"no register at {at}")
             if not register.writable:

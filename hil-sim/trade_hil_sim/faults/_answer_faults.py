@@ -1,6 +1,6 @@
 """The active faults of answers on one bus."""
 
-from trade_hil_sim.faults._commands import AnswerFault, Mute, Piece
+from trade_hil_sim.faults._commands import AnswerFault, AnswerPart, Mute
 
 
 class _Active:
@@ -48,9 +48,9 @@ class ActiveFaults:
         """Whether this answer is suppressed; counts as one match."""
         return self.strikes(Mute, (device_id,), instruction)
 
-    def strikes(self, kind: type[AnswerFault], ids: tuple[int, ...], instruction: str) -> bool:
+    def strikes(self, fault_type: type[AnswerFault], ids: tuple[int, ...], instruction: str) -> bool:
         """Whether a fault of this kind affects this answer; counts as one match."""
-        return any(a.hits(ids, instruction) for a in self._active if isinstance(a.fault, kind))
+        return any(a.hits(ids, instruction) for a in self._active if isinstance(a.fault, fault_type))
 
     def names(self, instruction: str) -> bool:
         """Whether a fault is about answers to this instruction only."""
@@ -58,9 +58,9 @@ class ActiveFaults:
 
     def shape(
         self, answer: bytes, ids: tuple[int, ...], instruction: str, *, but: tuple[type[AnswerFault], ...] = (Mute,)
-    ) -> list[Piece]:
+    ) -> list[AnswerPart]:
         """The answer after the active faults were applied, except those of some kinds."""
-        pieces = [Piece(answer)]
+        pieces = [AnswerPart(answer)]
         for active in self._active:
             if not isinstance(active.fault, but) and active.hits(ids, instruction):
                 pieces = active.fault.shape(pieces)

@@ -20,7 +20,7 @@ class SimulationError(ValueError):
     """A simulator cannot do what was requested; the message says what would be valid."""
 
 
-class Piece(NamedTuple):
+class AnswerPart(NamedTuple):
     """Part of an answer, and the delay with which it leaves."""
 
     data: bytes
@@ -52,7 +52,7 @@ class AnswerFault(_Devices, frozen=True, kw_only=True):
         whom = self.ids is None or any(i in self.ids for i in ids)
         return whom and self.instruction in {None, instruction}
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """The answer as this fault leaves it."""
         return pieces
 
@@ -60,7 +60,7 @@ class AnswerFault(_Devices, frozen=True, kw_only=True):
 class Mute(AnswerFault, frozen=True, tag="mute"):
     """Devices obey but do not answer."""
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """No part of the answer."""
         return pieces[:0]
 
@@ -70,19 +70,19 @@ class Late(AnswerFault, frozen=True, kw_only=True, tag="late"):
 
     s: Seconds
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """The same, later."""
-        return [Piece(data, late_s + self.s) for data, late_s in pieces]
+        return [AnswerPart(data, late_s + self.s) for data, late_s in pieces]
 
 
 class BadCrc(AnswerFault, frozen=True, tag="bad_crc"):
     """The last byte of the answer is wrong. On a CAN bus: the frame is destroyed, and sent again."""
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """The same with its last byte inverted."""
         *before, (data, late_s) = pieces
         wrong = bytes(byte ^ 0xFF for byte in data[-1:])
-        return [*before, Piece(data[:-1] + wrong, late_s)]
+        return [*before, AnswerPart(data[:-1] + wrong, late_s)]
 
 
 class Truncate(AnswerFault, frozen=True, kw_only=True, tag="truncate"):
@@ -90,10 +90,10 @@ class Truncate(AnswerFault, frozen=True, kw_only=True, tag="truncate"):
 
     missing: Annotated[int, Meta(ge=1)] = 3
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """The answer without its end."""
         *before, (data, late_s) = pieces
-        return [*before, Piece(data[: -self.missing], late_s)]
+        return [*before, AnswerPart(data[: -self.missing], late_s)]
 
 
 class Garbage(AnswerFault, frozen=True, kw_only=True, tag="garbage"):
@@ -105,9 +105,9 @@ class Garbage(AnswerFault, frozen=True, kw_only=True, tag="garbage"):
         """Refuse bytes that are not hex."""
         bytes.fromhex(self.hex)
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """Noise, then the same."""
-        return [Piece(bytes.fromhex(self.hex), pieces[0].late_s), *pieces]
+        return [AnswerPart(bytes.fromhex(self.hex), pieces[0].late_s), *pieces]
 
 
 class Dribble(AnswerFault, frozen=True, kw_only=True, tag="dribble"):
@@ -115,19 +115,19 @@ class Dribble(AnswerFault, frozen=True, kw_only=True, tag="dribble"):
 
     s: Seconds
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """Single bytes, each with a greater delay."""
         whole, late_s = b"".join(piece.data for piece in pieces), pieces[0].late_s
-        return [Piece(bytes([byte]), late_s + k * self.s) for k, byte in enumerate(whole)]
+        return [AnswerPart(bytes([byte]), late_s + k * self.s) for k, byte in enumerate(whole)]
 
 
 class Duplicate(AnswerFault, frozen=True, tag="duplicate"):
     """The answer comes twice."""
 
-    def shape(self, pieces: list[Piece]) -> list[Piece]:
+    def shape(self, pieces: list[AnswerPart]) -> list[AnswerPart]:
         """The same answer twice in a row."""
         span_s = pieces[-1].late_s - pieces[0].late_s
-        return [*pieces, *(Piece(data, late_s + span_s) for data, late_s in pieces)]
+        return [*pieces, *(AnswerPart(data, late_s + span_s) for data, late_s in pieces)]
 
 
 class Echo(_Order, frozen=True, kw_only=True, tag="echo"):

@@ -20,12 +20,12 @@ class MemoryTable(Memory[Register]):
         """Let an EEPROM register's value survive power loss."""
         register = self.model.by_name[name]
         span = slice(register.address, register.address + register.size)
-        self._kept[span] = self._bytes[span]
+        self._persistent[span] = self._bytes[span]
 
     def lose_power(self) -> None:
         """EEPROM registers and those of the firmware as kept, the others at their defaults."""
         self.restore(self.model.registers)
-        self._bytes[:RAM_BEGINS] = self._kept[:RAM_BEGINS]
+        self._bytes[:RAM_BEGINS] = self._persistent[:RAM_BEGINS]
         self.set("torque_limit", self.get("max_torque"))
 
     def factory_reset(self, spared: tuple[str, ...] = ()) -> None:
@@ -34,7 +34,7 @@ class MemoryTable(Memory[Register]):
         self.restore(self.model.registers)
         for name, value in values.items():
             self.set(name, value)
-        self._kept = bytearray(self._bytes)
+        self._persistent = bytearray(self._bytes)
 
     def read(self, address: int, length: int) -> bytes:
         """Bytes from the table; where there is no register, they are 0."""

@@ -14,7 +14,7 @@ Kind = Literal["received", "sent", "frame", "instruction", "event"]
 Direction = Literal["in", "out"]
 
 
-class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
+class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """One line of the log.
 
     - ``received`` and ``sent``: raw bytes, as the simulator read and wrote them. When a client has an answer, the
@@ -74,13 +74,13 @@ class ByteLog:
 
     def __init__(self, path: Path | None = None, *, keep: bool | None = None) -> None:
         self.path = path
-        self._entries: list[Entry] = []
+        self._entries: list[LogEntry] = []
         self._keep = path is None if keep is None else keep
         self._encoder = msgspec.json.Encoder()
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
         self._fd = None if path is None else os.open(path, flags, 0o644)
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LogEntry) -> None:
         """Record one entry; any thread may call this."""
         if self._keep:
             self._entries.append(entry)
@@ -88,7 +88,7 @@ class ByteLog:
             os.write(self._fd, self._encoder.encode(entry) + b"\n")
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LogEntry]:
         """A copy of what is kept in memory."""
         return list(self._entries)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, TypedDict
 
 import msgspec
 
-from trade_hil_sim.log._byte_log import Direction, Entry, Kind
+from trade_hil_sim.log._byte_log import Direction, Kind, LogEntry
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -36,27 +36,27 @@ class Span(TypedDict, total=False):
     """Only this bus."""
 
 
-def read_log(path: Path | str) -> list[Entry]:
+def read_log(path: Path | str) -> list[LogEntry]:
     """All entries of a log file so far, in the order they were written.
 
     A last line that is still being written is left out, so a running simulator's log can be read.
     """
     whole, _, _ = Path(path).read_bytes().rpartition(b"\n")
-    return msgspec.json.Decoder(Entry).decode_lines(whole) if whole else []
+    return msgspec.json.Decoder(LogEntry).decode_lines(whole) if whole else []
 
 
-def received(entries: Iterable[Entry], **span: "Unpack[Span]") -> bytes:
+def received(entries: Iterable[LogEntry], **span: "Unpack[Span]") -> bytes:
     """The bytes that came in, joined."""
     return b"".join(e.data for e in _of_kind("received", entries, **span))
 
 
-def sent(entries: Iterable[Entry], **span: "Unpack[Span]") -> bytes:
+def sent(entries: Iterable[LogEntry], **span: "Unpack[Span]") -> bytes:
     """The bytes that went out, joined."""
     return b"".join(e.data for e in _of_kind("sent", entries, **span))
 
 
 def frames(
-    entries: Iterable[Entry],
+    entries: Iterable[LogEntry],
     name: str | None = None,
     *,
     can_id: int | None = None,
@@ -64,7 +64,7 @@ def frames(
     source: str | None = None,
     direction: Direction | None = None,
     **span: "Unpack[Span]",
-) -> list[Entry]:
+) -> list[LogEntry]:
     """Frames that got through on CAN buses, in that order.
 
     Args:
@@ -82,8 +82,8 @@ def frames(
 
 
 def instructions(
-    entries: Iterable[Entry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
-) -> list[Entry]:
+    entries: Iterable[LogEntry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
+) -> list[LogEntry]:
     """Decoded instructions; broadcasts (id 254) count for every device.
 
     Args:
@@ -97,8 +97,8 @@ def instructions(
 
 
 def writes(
-    entries: Iterable[Entry], *, device_id: int | None = None, register: str | None = None, **span: "Unpack[Span]"
-) -> list[Entry]:
+    entries: Iterable[LogEntry], *, device_id: int | None = None, register: str | None = None, **span: "Unpack[Span]"
+) -> list[LogEntry]:
     """Every instruction that writes; arguments as `instructions`, and `register`: only those that touch it.
 
     On a Dynamixel bus: write, reg write, action, sync write, bulk write. On a CAN bus: SDO writes, and receive PDOs at
@@ -108,7 +108,9 @@ def writes(
     return [e for e in found if e.name in WRITING and (register is None or register in e.registers)]
 
 
-def motion_writes(entries: Iterable[Entry], *, device_id: int | None = None, **span: "Unpack[Span]") -> list[Entry]:
+def motion_writes(
+    entries: Iterable[LogEntry], *, device_id: int | None = None, **span: "Unpack[Span]"
+) -> list[LogEntry]:
     """The writes that could move something: those that touch torque or goal registers; arguments as `writes`.
 
     Of CAN drives: those that change controlword, mode or a target. Of arms: commands to move, set-points, freedrive.
@@ -119,19 +121,19 @@ def motion_writes(entries: Iterable[Entry], *, device_id: int | None = None, **s
 
 
 def events(
-    entries: Iterable[Entry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
-) -> list[Entry]:
+    entries: Iterable[LogEntry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
+) -> list[LogEntry]:
     """What devices did: ``motion_started``, ``at_rest``, ``watchdog_expired``, ...; arguments as `instructions`."""
     found = _of_kind("event", entries, **span)
     return [e for e in found if name in {None, e.name} and device_id in {None, e.device_id}]
 
 
 def _of_kind(
-    kind: Kind, entries: Iterable[Entry], *, since: float = -inf, until: float = inf, bus: str | None = None
-) -> Iterator[Entry]:
+    kind: Kind, entries: Iterable[LogEntry], *, since: float = -inf, until: float = inf, bus: str | None = None
+) -> Iterator[LogEntry]:
     return (e for e in entries if e.kind == kind and since <= e.t <= until and bus in {None, e.bus})
 
 
-def _concerns(entry: Entry, device_id: int | None) -> bool:
+def _concerns(entry: LogEntry, device_id: int | None) -> bool:
     named: Sequence[int | None] = entry.ids or (entry.device_id,)
     return device_id is None or device_id in named or (entry.device_id == BROADCAST and not entry.ids)

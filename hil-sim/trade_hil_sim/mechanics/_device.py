@@ -8,15 +8,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 from trade_hil_sim.mechanics._truth import DeviceState, GripperTruth
 from trade_robotfile import Joint
 
-Emit = Callable[[Entry], None]
+Emit = Callable[[LogEntry], None]
 """Adds a line to the log; a bus fills in its name."""
 
 
-def unheard(entry: Entry) -> None:
+def unheard(entry: LogEntry) -> None:
     """Discard a line: the device is on no bus."""
 
 
@@ -196,7 +196,7 @@ class JointModel(DeviceModel):
 
     def note(self, name: str, t: float, detail: str = "") -> None:
         """Log an event, with where the joint is."""
-        entry = Entry(
+        entry = LogEntry(
             t,
             "",
             "event",

@@ -79,9 +79,9 @@ class Mailbox:
         answer_s: how long a call may take.
     """
 
-    def __init__(self, who: str, answer_s: float) -> None:
-        self._who, self._answer_s = who, answer_s
-        self._asked: deque[tuple[Callable[[], None], Callable[[Exception], None]]] = deque()
+    def __init__(self, owner: str, answer_s: float) -> None:
+        self._who, self._answer_s = owner, answer_s
+        self._jobs: deque[tuple[Callable[[], None], Callable[[Exception], None]]] = deque()
         """For each call, the functions that carry it out and refuse it."""
         self._guard = threading.Lock()
         self._wake_write = -1
@@ -112,7 +112,7 @@ class Mailbox:
         with self._guard:
             if self._wake_write < 0:
                 raise self._closed()
-            self._asked.append((carry_out, done.set_exception))
+            self._jobs.append((carry_out, done.set_exception))
             self._ring()
         try:
             return done.result(self._answer_s)
@@ -128,8 +128,8 @@ class Mailbox:
         """In the thread, after a wake-up: make the queued calls."""
         with suppress(BlockingIOError):
             os.read(self.wake_read, 4096)
-        while self._asked:
-            self._asked.popleft()[0]()
+        while self._jobs:
+            self._jobs.popleft()[0]()
 
     def close(self) -> None:
         """In the thread, at its end: refuse queued and later calls."""
@@ -137,8 +137,8 @@ class Mailbox:
             os.close(self._wake_write)
             self._wake_write = -1
         os.close(self.wake_read)
-        while self._asked:
-            self._asked.popleft()[1](self._closed())
+        while self._jobs:
+            self._jobs.popleft()[1](self._closed())
 
     def _closed(self) -> SimulationError:
         return SimulationError(f"{self._who} is closed")

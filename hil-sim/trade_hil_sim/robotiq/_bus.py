@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.serial._device_bus import DeviceLine
 from trade_robotfile import Gripper as GripperRecord
 from trade_robotfile import Joint, SerialBus
@@ -92,7 +92,7 @@ class RobotiqBus(DeviceLine[Gripper]):
         hearing = [gripper for gripper in self._devices if baud in {None, gripper.baud} and not gripper.absent]
         for request in self._reader.feed(data) if hearing else ():
             if request is None:
-                self.log.add(Entry(t, self.name, "instruction", "damaged"))
+                self.log.add(LogEntry(t, self.name, "instruction", "damaged"))
             else:
                 self._carry_out(request, hearing, t)
 
@@ -122,7 +122,7 @@ class RobotiqBus(DeviceLine[Gripper]):
         address = request.write_at if writes else request.read_at
         moves = any(_moves(one, request) for one in meant) if names else False
         self.log.add(
-            Entry(
+            LogEntry(
                 t,
                 self.name,
                 "instruction",

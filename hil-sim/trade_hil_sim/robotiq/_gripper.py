@@ -10,7 +10,7 @@ from math import inf
 from typing import Final
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 from trade_hil_sim.mechanics._truth import GripperTruth
 from trade_hil_sim.serial._device_bus import LineDevice
 
@@ -360,7 +360,7 @@ class Gripper(LineDevice):
     def note(self, name: str, t: float, detail: str = "") -> None:
         """Log an event, with where the fingers are."""
         counts = self.position(t)
-        entry = Entry(
+        entry = LogEntry(
             t,
             "",
             "event",

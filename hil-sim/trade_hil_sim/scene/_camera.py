@@ -11,7 +11,7 @@ from typing import Final
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.mechanics._truth import BusState
 from trade_hil_sim.robot._bus_thread import BusThread, listener, ready
 from trade_robotfile import Camera, Sensor
@@ -178,4 +178,4 @@ class SceneCamera(BusThread):
         return head.encode("ascii") + picture
 
     def _note(self, name: str, detail: str) -> None:
-        self.log.add(Entry(t=time.monotonic(), bus=self.name, kind="event", name=name, detail=detail))
+        self.log.add(LogEntry(t=time.monotonic(), bus=self.name, kind="event", name=name, detail=detail))

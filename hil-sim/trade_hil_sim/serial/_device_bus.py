@@ -13,7 +13,7 @@ import msgspec
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.mechanics._device import DeviceModel
 from trade_hil_sim.mechanics._truth import BusState, DeviceState, GripperTruth
 from trade_hil_sim.serial._line import SerialLine
@@ -148,7 +148,7 @@ class DeviceLine(ABC, Generic[_Device]):
             raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
         return [device for device in self._devices if ids is None or device.device_id in ids]
 
-    def _emit(self, entry: Entry) -> None:
+    def _emit(self, entry: LogEntry) -> None:
         self.log.add(msgspec.structs.replace(entry, bus=self.name))
 
     # the far end of the line; called from its thread

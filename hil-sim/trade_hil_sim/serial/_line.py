@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
-from trade_hil_sim.log._byte_log import ByteLog, Entry, Kind
+from trade_hil_sim.log._byte_log import ByteLog, Kind, LogEntry
 from trade_hil_sim.robot._bus_thread import BusThread
 from trade_hil_sim.serial._pty import Terminal
 
@@ -63,7 +63,7 @@ class SerialLine(BusThread):
         super().__init__(name, ANSWER_S)
         self.link, self.paced = link, paced
         self._peer, self._log = peer, log or ByteLog(keep=False)
-        self._out: list[_Chunk] = []
+        self._outgoing: list[_Chunk] = []
         self._order = 0
         self._wire_free_at = 0.0
         self._baud: int | None = None
@@ -93,7 +93,7 @@ class SerialLine(BusThread):
             due = max(due, self._wire_free_at) + after_s + len(data) * self._byte_s()
             self._wire_free_at = due
         self._order += 1
-        heapq.heappush(self._out, _Chunk(due + late_s, self._order, data, name, device_id))
+        heapq.heappush(self._outgoing, _Chunk(due + late_s, self._order, data, name, device_id))
 
     # for any thread
 
@@ -142,14 +142,16 @@ class SerialLine(BusThread):
         waits = [60.0]
         if (wake_in_s := self._peer.wake_in_s()) is not None:
             waits.append(max(0.0, wake_in_s))
-        if self._out:
-            left_s = self._out[0].due - time.monotonic() - SPIN_S
+        if self._outgoing:
+            left_s = self._outgoing[0].due - time.monotonic() - SPIN_S
             waits.append(int(max(0.0, left_s) * 1e3) / 1e3)
         return min(waits)
 
     def _write_due(self) -> None:
-        while self._terminal is not None and self._out and self._out[0].due - time.monotonic() < SPIN_S + 0.001:
-            chunk = heapq.heappop(self._out)
+        while (
+            self._terminal is not None and self._outgoing and self._outgoing[0].due - time.monotonic() < SPIN_S + 0.001
+        ):
+            chunk = heapq.heappop(self._outgoing)
             # logged first: when a client has an answer, the log has it too, and the wire does not wait for the log
             due = max(chunk.due, time.monotonic())
             self._note("sent", chunk.data, due, name=chunk.name, device_id=chunk.device_id)
@@ -165,7 +167,7 @@ class SerialLine(BusThread):
             taken = 0
         if taken < len(chunk.data):
             detail = f"the client does not read: of the bytes just sent, the last {len(chunk.data) - taken} are lost"
-            self._log.add(Entry(time.monotonic(), self.name, "event", "overrun", detail=detail))
+            self._log.add(LogEntry(time.monotonic(), self.name, "event", "overrun", detail=detail))
 
     def _read(self) -> None:
         if self._terminal is None:
@@ -184,7 +186,7 @@ class SerialLine(BusThread):
         self._peer.received(data, t)
 
     def _note(self, kind: Kind, data: bytes, t: float, *, name: str = "", device_id: int | None = None) -> None:
-        self._log.add(Entry(t, self.name, kind, name, device_id=device_id, hex=data.hex()))
+        self._log.add(LogEntry(t, self.name, kind, name, device_id=device_id, hex=data.hex()))
 
     def _byte_s(self) -> float:
         return BITS_PER_BYTE / self._baud if self._baud else 0.0
@@ -193,17 +195,17 @@ class SerialLine(BusThread):
         terminal, self._terminal = self._terminal, None
         if terminal is None:
             return
-        self._out.clear()
+        self._outgoing.clear()
         self._epoll.unregister(terminal.master)
         terminal.close()
-        self._log.add(Entry(time.monotonic(), self.name, "event", event))
+        self._log.add(LogEntry(time.monotonic(), self.name, "event", event))
 
     def _replug(self) -> None:
         if self._terminal is not None:
             return
         self._terminal = Terminal(self.link)
         self._epoll.register(self._terminal.master, select.EPOLLIN)
-        self._log.add(Entry(time.monotonic(), self.name, "event", "plugged"))
+        self._log.add(LogEntry(time.monotonic(), self.name, "event", "plugged"))
 
 
 def _sleep_until(due: float) -> None:

@@ -75,9 +75,9 @@ class Memory(Generic[_Register_co]):
     def __init__(self, registers: Mapping[str, _Register_co], ends: int) -> None:
         self._by_name = registers
         self._bytes = bytearray(ends)
-        self._at: list[_Register_co | None] = [None] * ends
+        self._by_address: list[_Register_co | None] = [None] * ends
         for register in registers.values():
-            self._at[register.address : register.address + register.size] = [register] * register.size
+            self._by_address[register.address : register.address + register.size] = [register] * register.size
 
     def get(self, name: str) -> int:
         """A register's value in device units."""
@@ -99,8 +99,8 @@ class Memory(Generic[_Register_co]):
 
     def touched(self, address: int, length: int) -> tuple[str, ...]:
         """Names of the registers in a range, in order and once each."""
-        inside = range(address, min(address + length, len(self._at)))
-        found = (self._at[self._target(at)] for at in inside)
+        inside = range(address, min(address + length, len(self._by_address)))
+        found = (self._by_address[self._target(at)] for at in inside)
         return tuple(dict.fromkeys(register.name for register in found if register is not None))
 
     def _target(self, address: int) -> int:

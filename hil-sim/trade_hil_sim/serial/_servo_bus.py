@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.mechanics._device import start_rad
 from trade_hil_sim.serial._device_bus import DeviceLine
 from trade_hil_sim.serial._packets import BROADCAST, Packet, PacketReader, Writing
@@ -104,7 +104,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
             self._deaf_to = baud
             rates = sorted({servo.baud for servo in self._devices})
             detail = f"the client speaks at {baud}, the devices listen at {rates}"
-            self.log.add(Entry(t, self.name, "event", "wrong_baud", detail=detail))
+            self.log.add(LogEntry(t, self.name, "event", "wrong_baud", detail=detail))
             self._reader.reset()
         return hearing
 
@@ -123,14 +123,16 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
         ids = tuple(wish.device_id for wish in asked) if packet.device_id == BROADCAST else ()
         address = asked[0].address if asked else None
         data = packet.params.hex()
-        self.log.add(Entry(t, self.name, "instruction", packet.name, packet.device_id, ids, hex=data, address=address))
+        self.log.add(
+            LogEntry(t, self.name, "instruction", packet.name, packet.device_id, ids, hex=data, address=address)
+        )
 
     def _note_writing(self, name: str, writing: Writing, t: float) -> None:
         addressed = self._addressed(writing.device_id)
         registers = self._touched([(servo, writing) for servo in addressed or self._devices])
         moves = bool(self.motion & set(registers))
         mover = addressed[0] if moves and len(addressed) == 1 else None
-        entry = Entry(
+        entry = LogEntry(
             t,
             self.name,
             "instruction",

@@ -7,10 +7,10 @@ from typing import Final
 import msgspec
 
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 
 from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
-from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way
+from ._motions import AtRest, Braking, Free, Motion, PathMotion, Servo, Speed
 from ._table import CB3, E_SERIES, MODELS, RobotMode, SafetyMode, Series
 
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -58,14 +58,14 @@ class Arm:
         self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF
         self.safety_mode = SafetyMode.NORMAL
         self.speed_fraction = 1.0
-        self.emit: Callable[[Entry], None] = lambda _: None
+        self.emit: Callable[[LogEntry], None] = lambda _: None
         self.stopped: Callable[[], None] = lambda: None
         """Called when safety ends whatever program runs."""
         self.paused: Callable[[bool], None] = lambda _: None
         """Called when a safeguard stop pauses it, and when that is over."""
         self.t = t
         self.jammed = False
-        self._motion: Motion = Held()
+        self._motion: Motion = AtRest()
         self._moving = False
         self._unlock_s, self._locked_at = unlock_s, t
         self._jammed_s = 0.0
@@ -130,7 +130,7 @@ class Arm:
         dt *= self._pace
         q, self.qd = self._motion.step(self.q, self.qd, dt * self.speed_fraction if self.ready else dt)
         if self._motion.done:
-            self._motion = Free() if self.freedrive else Held()
+            self._motion = Free() if self.freedrive else AtRest()
             self.qd = (0.0,) * 6
         if any(abs(angle) > _LIMIT_RAD for angle in q):
             self.protective_stop("a joint is at its limit")
@@ -168,7 +168,7 @@ class Arm:
     def move_joints(self, goal: Sequence[float], speed: float, accel: float) -> bool:
         """Move straight in joint space: speed in rad/s and acceleration of the joint that turns most."""
         length = max(abs(b - a) for a, b in zip(self.q, goal, strict=True))
-        return self._begin(Way([self.q, tuple(goal)], length, speed, accel))
+        return self._begin(PathMotion([self.q, tuple(goal)], length, speed, accel))
 
     def move_line(self, pose: Sequence[float], speed: float, accel: float) -> bool:
         """Move straight in space: speed in m/s; False, and a protective stop, if the way leads out of reach."""
@@ -183,7 +183,7 @@ class Arm:
                 return False
             points.append(found)
             near = found
-        return self._begin(Way(points, metres or turn, speed, accel))
+        return self._begin(PathMotion(points, metres or turn, speed, accel))
 
     def servo(self, target: Sequence[float]) -> bool:
         """Follow this target, at once."""
@@ -201,11 +201,11 @@ class Arm:
 
     def free(self, on: bool) -> bool:
         """Switch freedrive."""
-        return self._begin(Free() if on else Held())
+        return self._begin(Free() if on else AtRest())
 
     def halt(self, decel_rad_s2: float = _HALT_RAD_S2) -> None:
         """Brake, and hold."""
-        self._motion = Braking(decel_rad_s2) if self._moving else Held()
+        self._motion = Braking(decel_rad_s2) if self._moving else AtRest()
 
     def _begin(self, motion: Motion) -> bool:
         if not self.ready:
@@ -264,7 +264,7 @@ class Arm:
 
     def reboot(self) -> None:
         """Reset as after a loss of power: off, its brakes on, all state lost."""
-        self._motion, self._moving, self.qd, self._pace = Held(), False, (0.0,) * 6, 1.0
+        self._motion, self._moving, self.qd, self._pace = AtRest(), False, (0.0,) * 6, 1.0
         self._modes.clear()
         self.safety_mode, self.speed_fraction = SafetyMode.NORMAL, 1.0
         self._enter(RobotMode.POWER_OFF)
@@ -277,4 +277,4 @@ class Arm:
     def note(self, name: str, *, detail: str = "") -> None:
         """Log an event, with where the joints are."""
         where = msgspec.json.encode([round(angle, 6) for angle in self.q]).decode()
-        self.emit(Entry(self.t, "", "event", name, joint=self.name, detail=detail or where))
+        self.emit(LogEntry(self.t, "", "event", name, joint=self.name, detail=detail or where))

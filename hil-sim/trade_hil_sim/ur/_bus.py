@@ -13,7 +13,7 @@ import msgspec
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, LogEntry
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState
 from trade_hil_sim.robot._bus_thread import BusThread, ready
 from trade_robotfile import Arm as ArmRecord
@@ -207,7 +207,7 @@ class UrBus(BusThread):
                     answer = self._dashboard.answer(line)
                     detail = f"{line} -> {answer}"
                     t = time.monotonic()
-                    self._emit(Entry(t, "", "instruction", "dashboard", source=client.name, detail=detail))
+                    self._emit(LogEntry(t, "", "instruction", "dashboard", source=client.name, detail=detail))
                     self._say(client, answer.encode() + b"\n", "dashboard")
             case _:
                 if (whole := client.held.rfind(b"\nend\n")) >= 0:
@@ -325,8 +325,8 @@ class UrBus(BusThread):
                 raise SimulationError(f"an arm has nothing like {type(command).__name__}")
 
     def _note(self, name: str, *, source: str = "", detail: str = "") -> None:
-        self._emit(Entry(time.monotonic(), "", "event", name, source=source, detail=detail))
+        self._emit(LogEntry(time.monotonic(), "", "event", name, source=source, detail=detail))
 
-    def _emit(self, entry: Entry) -> None:
+    def _emit(self, entry: LogEntry) -> None:
         """Log it as of now: the arm's own time may lag when this thread is late."""
         self.log.add(msgspec.structs.replace(entry, t=time.monotonic(), bus=self.name, device_id=_ARM))

@@ -31,7 +31,7 @@ class Dashboard:
         self._loaded = _NAME
         arm = self._arm
         numbers = ".".join(str(number) for number in arm.series.version)
-        self._asked: dict[str, Callable[[], str]] = {
+        self._queries: dict[str, Callable[[], str]] = {
             "robotmode": lambda: f"Robotmode: {arm.robot_mode.name}",
             "safetystatus": lambda: f"Safetystatus: {arm.safety_mode.name}",
             "safetymode": lambda: f"Safetymode: {arm.safety_mode.name}",
@@ -62,8 +62,8 @@ class Dashboard:
         """The answer to a line."""
         word = " ".join(line.split())
         low = word.lower()
-        if low in self._asked and low not in self._arm.series.lacks:
-            return self._asked[low]()
+        if low in self._queries and low not in self._arm.series.lacks:
+            return self._queries[low]()
         if not (low in self._ordered or low.startswith(("load ", "popup "))):
             return f'could not understand: "{word}"'
         if not self.remote:

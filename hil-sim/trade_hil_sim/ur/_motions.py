@@ -30,7 +30,7 @@ class Motion(ABC):
         """Angles and speeds one time step later."""
 
 
-class Held(Motion):
+class AtRest(Motion):
     """Rest, by the brakes or by holding a position."""
 
     done = True
@@ -40,11 +40,11 @@ class Held(Motion):
         return q, (0.0,) * 6
 
 
-class Free(Held):
+class Free(AtRest):
     """Freedrive without a push: the arm stays where it is."""
 
 
-class Way(Motion):
+class PathMotion(Motion):
     """Moves through points with a trapezoidal speed profile.
 
     Args:

@@ -10,10 +10,10 @@ from typing import Final
 
 import msgspec
 
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.log._byte_log import LogEntry
 
 from ._arm import Arm
-from ._motions import Way
+from ._motions import PathMotion
 from ._table import Command
 
 STOPPED: Final = 1
@@ -45,7 +45,7 @@ class Program:
         step_s: the controller's cycle time.
     """
 
-    def __init__(self, arm: Arm, emit: Callable[[Entry], None], step_s: float) -> None:
+    def __init__(self, arm: Arm, emit: Callable[[LogEntry], None], step_s: float) -> None:
         self.arm = arm
         self.state = STOPPED
         """``runtime_state``."""
@@ -62,7 +62,7 @@ class Program:
         self._busy = False
         """A command that is answered when its motion has ended is under way."""
         self._shown = Command.NOTHING
-        self._async: Way | None = None
+        self._async: PathMotion | None = None
         self._operation = self._writes = 0
         arm.stopped, arm.paused = self.stop, self.pause
 
@@ -226,7 +226,7 @@ class Program:
             begun = arm.move_joints(joints, d[6], d[7])
         else:
             begun = arm.move_line(goal if number == Command.MOVE_L else arm.pose(goal), d[6], d[7])
-        if begun and self.ints.get(1, 0) and isinstance(arm.motion, Way):
+        if begun and self.ints.get(1, 0) and isinstance(arm.motion, PathMotion):
             self._async = arm.motion
             self._operation = (self._operation + 1) % 128
             self._tell_async(running=True)
@@ -262,4 +262,4 @@ class Program:
 
     def _log(self, name: str, *, detail: str, moves: bool) -> None:
         t = time.monotonic()  # the time of arrival: the arm's own time may lag
-        self._emit(Entry(t, "", "instruction", name, joint=self.arm.name, detail=detail, moves=moves))
+        self._emit(LogEntry(t, "", "instruction", name, joint=self.arm.name, detail=detail, moves=moves))

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Final
 
-from trade_hil_sim.faults._commands import Piece
+from trade_hil_sim.faults._commands import AnswerPart
 from trade_hil_sim.robot._bus_thread import listener
 
 PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
@@ -66,7 +66,7 @@ class Client:
         self.held += data
         return bool(data)
 
-    def tell(self, pieces: Sequence[Piece]) -> None:
+    def tell(self, pieces: Sequence[AnswerPart]) -> None:
         """Queue an answer. A late one delays those behind it: a stream keeps its order."""
         now = time.monotonic()
         for data, late_s in pieces:

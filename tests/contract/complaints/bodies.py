@@ -20,7 +20,19 @@ from tests.unit.drivers.motor_rig import KINDS as MOTOR_KINDS
 from tests.unit.drivers.tail_rig import TailRig
 from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, Motor, Robot, parse
-from trade_hil_sim import Arm, BadCrc, Emergency, Entry, HardwareFault, Mute, Place, Servo, Truncate, UrBus, WrongModel
+from trade_hil_sim import (
+    Arm,
+    BadCrc,
+    Emergency,
+    HardwareFault,
+    LogEntry,
+    Mute,
+    Place,
+    Servo,
+    Truncate,
+    UrBus,
+    WrongModel,
+)
 
 __all__ = ["KINDS", "Body", "Call", "Controllers", "outcome"]
 
@@ -124,11 +136,11 @@ class Body:
     def farthest_rad(self) -> float:
         return float(self.rig.robot.joints[0].max_rad)
 
-    def moves(self) -> list[Entry]:
+    def moves(self) -> list[LogEntry]:
         """The commands it got that could move it."""
         return list(self.rig.moves()) if hasattr(self.rig, "moves") else list(self.rig.controlwords(self.device_id))
 
-    def events(self, name: str, since: float = 0.0) -> list[Entry]:
+    def events(self, name: str, since: float = 0.0) -> list[LogEntry]:
         return list(self.rig.events(name, self.device_id, since))
 
     def wait_until_under_way(self) -> None:

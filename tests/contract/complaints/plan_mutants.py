@@ -5,18 +5,18 @@ from collections.abc import Hashable
 import pytest
 
 from trade_drivers.interfaces import _trajectory
-from trade_drivers.motion._ramps import Passage
+from trade_drivers.motion._ramps import RampSegment
 from trade_gateway.recording._timeline import Timeline
 
 
 def every_piece_is_cubic(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Passage, "ramped", lambda *_: None)
+    patch.setattr(RampSegment, "ramped", lambda *_: None)
 
 
 def a_piece_takes_the_acceleration_that_it_needs(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(_trajectory, "_keep", lambda *_: None)
-    ramped = Passage.ramped
-    patch.setattr(Passage, "ramped", lambda self, speed, accel: ramped(self, speed, 2 * accel))
+    ramped = RampSegment.ramped
+    patch.setattr(RampSegment, "ramped", lambda self, speed, accel: ramped(self, speed, 2 * accel))
 
 
 def rest_is_exactly_0(patch: pytest.MonkeyPatch) -> None:

@@ -6,27 +6,27 @@ import pytest
 
 from trade.transport.addresses import Attempts
 from trade.transport.endpoints import Endpoint
-from trade_gateway.cli.hardware._calibrate import Ends, Sweep
-from trade_gateway.supervisor._restart_policy import Life, Transition
+from trade_gateway.cli.hardware._calibrate import Sweep, TravelEnds
+from trade_gateway.supervisor._restart_policy import ChildLife, Transition
 
 
 def a_range_is_the_least_and_the_greatest_reading(patch: pytest.MonkeyPatch) -> None:
-    def until(self: Sweep, done: Callable[[], bool], longest_s: float) -> Ends:
+    def until(self: Sweep, done: Callable[[], bool], longest_s: float) -> TravelEnds:
         readings = [self.read()]
         while not done():
             readings.append(self.read())
-        return Ends(min(readings), max(readings), readings[-1])
+        return TravelEnds(min(readings), max(readings), readings[-1])
 
     patch.setattr(Sweep, "until", until)
 
 
 def a_start_without_its_device_is_a_crash(patch: pytest.MonkeyPatch) -> None:
-    ended = Life.ended
+    ended = ChildLife.ended
 
-    def counted(self: Life, now: float, how: str, *, absent: bool = False) -> Transition | None:
+    def counted(self: ChildLife, now: float, how: str, *, absent: bool = False) -> Transition | None:
         return ended(self, now, how)
 
-    patch.setattr(Life, "ended", counted)
+    patch.setattr(ChildLife, "ended", counted)
 
 
 def no_rule_of_udev_is_read(patch: pytest.MonkeyPatch) -> None:

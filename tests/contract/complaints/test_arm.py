@@ -18,7 +18,7 @@ from trade_drivers import Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.testing import FakeGripper
 from trade_drivers.vendors.ur import identify
 from trade_gateway.cli.hardware._doctor_robot import controllers
-from trade_gateway.recording._sources import Sources, Wanted
+from trade_gateway.recording._sources import RecordedParts, Sources
 from trade_gateway.recording._timeline import Timeline
 
 pytestmark = pytest.mark.realtime
@@ -46,7 +46,7 @@ def test_a_gripper_is_missing_from_joint_states(folder: Path) -> None:
             hand.activate()
             hand.close()
             wait_until(lambda: heard[-1]["position"] == [0.0], "ROS hears that the gripper has closed")
-            recorded = Sources(stand.container, Wanted(groups=["rosie"]), threading.Event(), Timeline())
+            recorded = Sources(stand.container, RecordedParts(groups=["rosie"]), threading.Event(), Timeline())
             recorded.look()
             assert f"{HAND}.state" in recorded.labels(), "the recording lacks the gripper"
             recorded.close()

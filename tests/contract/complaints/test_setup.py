@@ -16,7 +16,7 @@ from tests.unit.gateway.test_life import launched, life
 from tests.unit.trade.test_addresses import GOOD, VPN, Wire, as_written
 from trade.transport.addresses import Attempts
 from trade_drivers import Joint
-from trade_gateway.cli.hardware._calibrate import Ends, Sweep, measured
+from trade_gateway.cli.hardware._calibrate import Sweep, TravelEnds, measured
 from trade_gateway.supervisor._restart_policy import State
 
 JOINT = Joint(
@@ -24,7 +24,7 @@ JOINT = Joint(
 )
 
 
-def swept(*counts: int) -> Ends:
+def swept(*counts: int) -> TravelEnds:
     """What a sweep by hand over these positions measures, in counts."""
     bench: Any = Hand(angles(*counts))
     return Sweep(bench, JOINT.id, JOINT.name).until(done_after(len(counts) - 1), 60.0)

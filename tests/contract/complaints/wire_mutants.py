@@ -16,7 +16,7 @@ from trade_drivers.joints.serial import Answer, ServoExchange
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402 import _wire as wire
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.cia402._table import DictionaryEntry
 from trade_drivers.vendors.cia402._wire import Net
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Feedback
@@ -83,7 +83,7 @@ def a_feetech_that_is_silent_reads_zero(patch: pytest.MonkeyPatch) -> None:
 
 
 def a_write_is_done_when_it_is_sent(patch: pytest.MonkeyPatch) -> None:
-    def write(self: Net, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Iterator[None]:
+    def write(self: Net, node: int, entry: DictionaryEntry, value: int, gate: Gate = lambda: None) -> Iterator[None]:
         gate()
         self._port.send(table.SDO_REQUEST + node, next(wire.download(entry.index, entry.sub, entry.encode(value))).data)
         yield

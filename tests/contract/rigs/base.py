@@ -14,7 +14,7 @@ from tests.unit import drivers
 from tests.unit.drivers.conftest import Outcome
 from trade import Container, Handle, where
 from trade.errors import TradeError
-from trade_hil_sim import Absent, Entry, received
+from trade_hil_sim import Absent, LogEntry, received
 
 PROCESSES = Path(next(iter(drivers.__path__)))
 
@@ -213,7 +213,7 @@ class SafetyRig(ABC):
         return self.sent_away(since)
 
     @abstractmethod
-    def events(self, name: str, since: float) -> Sequence[Entry]:
+    def events(self, name: str, since: float) -> Sequence[LogEntry]:
         """What the simulator noted of the device."""
 
     @property
@@ -252,6 +252,6 @@ class SafetyRig(ABC):
         """Wait until the device is left alone; since when nothing may be sent."""
         raise NotImplementedError
 
-    def heard(self, since: float) -> Sequence[Entry]:
+    def heard(self, since: float) -> Sequence[LogEntry]:
         """Everything that the device received."""
         return received(self.bench.log, since=since)

@@ -13,7 +13,7 @@ from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
 from trade.errors import DeviceFault
 from trade_drivers import parse
-from trade_hil_sim import Entry, Late, Mute, WrongModel
+from trade_hil_sim import Late, LogEntry, Mute, WrongModel
 
 _NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
 _QUICK_STOP = 0x02
@@ -42,7 +42,7 @@ class CanJointRig(JointRig):
         assert not self.bench.events("motion_started", SECOND)
         assert "operation_enabled" not in [entry.detail for entry in self.bench.events("state", SECOND)]
 
-    def heard(self, since: float) -> Sequence[Entry]:
+    def heard(self, since: float) -> Sequence[LogEntry]:
         return [entry for entry in self.bench.frames(since=since) if entry.direction == "in"]
 
 
@@ -127,7 +127,7 @@ class Cia402Rig(CanJointRig):
         self._halted()
         assert self.truth().position_rad < 0.8
 
-    def _heartbeats(self) -> list[Entry]:
+    def _heartbeats(self) -> list[LogEntry]:
         return [entry for entry in self.bench.frames("heartbeat") if entry.can_id == 0x77F]
 
     def armed(self) -> bool:

@@ -8,7 +8,7 @@ import pytest
 from tests.contract.rigs.joints import FIRST, SECOND, JointRig
 from tests.support.simulated_robots import HEAD
 from tests.unit.drivers.conftest import Rig, goal_counts
-from trade_hil_sim import BadCrc, Entry, Mute, WrongModel, instructions, writes
+from trade_hil_sim import BadCrc, LogEntry, Mute, WrongModel, instructions, writes
 
 _COUNTS_PER_RAD = 4096 / 6.283185307179586
 _WATCHDOG_S = 0.3
@@ -20,13 +20,13 @@ class SerialJointRig(JointRig):
     says_on_waking: ClassVar = ("held up",)
     lost = (BadCrc(ids=(FIRST,), count=1), Mute(ids=(SECOND,), count=1, instruction="read"))
 
-    def goal_of(self, entry: Entry) -> int:
+    def goal_of(self, entry: LogEntry) -> int:
         return goal_counts(entry)
 
-    def commanded(self, since: float = 0.0) -> Sequence[Entry]:
+    def commanded(self, since: float = 0.0) -> Sequence[LogEntry]:
         return self.bench.moves(since=since)
 
-    def written(self) -> Sequence[Entry]:
+    def written(self) -> Sequence[LogEntry]:
         return writes(self.bench.log)
 
     def targets_rad(self, since: float) -> Sequence[float]:

@@ -6,7 +6,7 @@ from tests.contract.rigs.dynamixel import SerialJointRig
 from tests.contract.rigs.joints import FIRST, SECOND
 from tests.support.simulated_robots import TAIL
 from tests.unit.drivers.tail_rig import COUNTS_PER_RAD, TailRig, goal_of, lead_counts, measured_before
-from trade_hil_sim import Entry, WrongModel
+from trade_hil_sim import LogEntry, WrongModel
 
 
 class FeetechRig(SerialJointRig):
@@ -34,7 +34,7 @@ class FeetechRig(SerialJointRig):
     def on_the_bench(self) -> Any:
         return TailRig(self.folder, self.undo)
 
-    def goal_of(self, entry: Entry) -> int:
+    def goal_of(self, entry: LogEntry) -> int:
         return goal_of(entry)
 
     def judge_ended(self) -> None:

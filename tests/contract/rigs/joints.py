@@ -14,7 +14,7 @@ from trade import Container
 from trade.errors import DeviceFault, TradeError
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
-from trade_hil_sim import Absent, Entry, Mute, Place
+from trade_hil_sim import Absent, LogEntry, Mute, Place
 
 __all__ = ["FIRST", "SECOND", "JointRig"]
 
@@ -157,7 +157,7 @@ class JointRig(SafetyRig):
     def travelled(self) -> float:
         return float(self.truth().position_rad) / (0.93 * self.max_rad)
 
-    def events(self, name: str, since: float) -> Sequence[Entry]:
+    def events(self, name: str, since: float) -> Sequence[LogEntry]:
         return self.bench.events(name, FIRST, since)
 
     def driver_process(self) -> DriverProcess:

@@ -14,7 +14,7 @@ from tests.unit.drivers.conftest import Outcome
 from tests.unit.drivers.gripper_rig import HandRig, silent
 from trade import Container
 from trade.errors import DeviceError
-from trade_hil_sim import Entry, Mute, WrongModel, events
+from trade_hil_sim import LogEntry, Mute, WrongModel, events
 
 _SLOW_M_S = 0.02
 _OPEN_M = 0.085
@@ -123,7 +123,7 @@ class RobotiqRig(SafetyRig):
     def travelled(self) -> float:
         return 1 - float(self.bench.truth.width_m) / _OPEN_M
 
-    def events(self, name: str, since: float) -> Sequence[Entry]:
+    def events(self, name: str, since: float) -> Sequence[LogEntry]:
         return events(self.bench.log, name, since=since)
 
     def driver_process(self) -> DriverProcess:

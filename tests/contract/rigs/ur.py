@@ -13,7 +13,7 @@ from tests.unit.drivers.arm_rig import FAR, SLOW, ArmRig, answers
 from tests.unit.drivers.attached_arm import ARM, AT_HOME
 from tests.unit.drivers.conftest import Outcome, written_now
 from trade import Container
-from trade_hil_sim import Arm, Entry, events, instructions
+from trade_hil_sim import Arm, LogEntry, events, instructions
 
 _ONE_DEVICE = "an arm has a controller of its own"
 _LIMITS = "unit/drivers/test_ur_way.py has the limits of arms"
@@ -122,7 +122,7 @@ class UrRig(SafetyRig):
     def travelled(self) -> float:
         return float(self.bench.base_rad) / FAR[0]
 
-    def events(self, name: str, since: float) -> Sequence[Entry]:
+    def events(self, name: str, since: float) -> Sequence[LogEntry]:
         return events(self.bench.log, name, since=since)
 
     def driver_process(self) -> DriverProcess:
@@ -148,5 +148,5 @@ class UrRig(SafetyRig):
         wait_until(lambda: self.bench.truth.program == "", "its program has ended")
         return max(entry.t for entry in self.bench.log)
 
-    def heard(self, since: float) -> Sequence[Entry]:
+    def heard(self, since: float) -> Sequence[LogEntry]:
         return [entry for entry in self.bench.moves(since) if entry.t > since]

@@ -7,7 +7,7 @@ from typing import Final
 
 from tests.endurance.explore._records import Held, Moved, Stopped
 from tests.endurance.explore._robots import KINDS
-from trade_hil_sim import Entry, events
+from trade_hil_sim import LogEntry, events
 
 _HELD_RAD: Final = 0.031
 """A joint has arrived within 0.03 rad of its goal if something blocks it, and takes the rest once that is gone."""
@@ -15,7 +15,7 @@ _REFUSED: Final = frozenset({"LockLost", "LockedByOther", "NotLocked"})
 
 
 def violations(
-    logs: Mapping[str, Sequence[Entry]],
+    logs: Mapping[str, Sequence[LogEntry]],
     held: Sequence[Held],
     moved: Sequence[Moved],
     stopped: Sequence[Stopped],
@@ -47,7 +47,7 @@ def _until_moved_again(stop: Stopped, calls: Sequence[Moved]) -> Stopped:
     return stop._replace(until=min([stop.until, *again]))
 
 
-def _moves_in(log: Sequence[Entry], stop: Stopped, ended: float) -> list[str]:
+def _moves_in(log: Sequence[LogEntry], stop: Stopped, ended: float) -> list[str]:
     """Rules S08, S09 and S11: what a stop or the loss of a lock has brought to rest gets no goal, and does not move."""
     rests = stop.since + stop.rests_s
     goals = KINDS[stop.group].goals(log, rests, stop.until)
@@ -66,7 +66,7 @@ def _moves_in(log: Sequence[Entry], stop: Stopped, ended: float) -> list[str]:
     ]
 
 
-def _moves_without_call(group: str, log: Sequence[Entry], moved: Sequence[Moved], ended: float) -> list[str]:
+def _moves_without_call(group: str, log: Sequence[LogEntry], moved: Sequence[Moved], ended: float) -> list[str]:
     """Rules S04 to S06: each motion is within the time of calls that move its group, and of what these may leave."""
     asked = list(_joined((one.since, one.until + one.lasts_s + KINDS[group].settles_s) for one in moved))
     for since, until in _motions(log, ended):
@@ -92,10 +92,10 @@ def _joined(spans: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float
         yield current
 
 
-def _motions(log: Sequence[Entry], ended: float) -> list[tuple[float, float]]:
+def _motions(log: Sequence[LogEntry], ended: float) -> list[tuple[float, float]]:
     """When a device began to move and when it rested again, by its own shaft."""
     found: list[tuple[float, float]] = []
-    began: dict[int | None, Entry] = {}
+    began: dict[int | None, LogEntry] = {}
     for one in events(log):
         if one.name == "motion_started":
             began.setdefault(one.device_id, one)

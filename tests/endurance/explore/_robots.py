@@ -11,7 +11,7 @@ from tests.support.simulated_robots import HEAD, TAIL
 from tests.unit.drivers.legs import COUNTS_PER_RAD, GO, HALT, LEG
 from tests.unit.drivers.motor_rig import DAMIAO, ODRIVE
 from trade_drivers import Robot, parse
-from trade_hil_sim import DynamixelBus, Entry, motion_writes
+from trade_hil_sim import DynamixelBus, LogEntry, motion_writes
 from trade_hil_sim.cia402 import Cia402Bus
 from trade_hil_sim.damiao import DamiaoBus
 from trade_hil_sim.feetech import FeetechBus
@@ -24,23 +24,23 @@ _CREEPS_S: Final = 1.0
 """A Dynamixel shows no speed below 0.036 rad/s: a slow joint has still 0.03 rad to go when it seems to rest."""
 
 
-def _goal_register(entry: Entry) -> float | None:
+def _goal_register(entry: LogEntry) -> float | None:
     """Servos get a goal only while they move: where to does not matter."""
     return float("inf") if any("goal" in register for register in entry.registers) else None
 
 
-def _cia402(entry: Entry) -> float | None:
+def _cia402(entry: LogEntry) -> float | None:
     if entry.name != "rpdo1" or len(entry.data) < 6:
         return None
     word, counts = struct.unpack("<Hi", entry.data[:6])
     return counts / COUNTS_PER_RAD if word & GO and not word & HALT else None
 
 
-def _odrive(entry: Entry) -> float | None:
+def _odrive(entry: LogEntry) -> float | None:
     return struct.unpack("<f", entry.data[:4])[0] * tau if entry.name == "set_input_pos" else None
 
 
-def _damiao(entry: Entry) -> float | None:
+def _damiao(entry: LogEntry) -> float | None:
     return struct.unpack("<f", entry.data[:4])[0] if entry.name == "pos_vel" else None
 
 
@@ -51,7 +51,7 @@ class RobotKind:
     group: str
     text: str = field(repr=False)
     simulator: Any
-    goal: Callable[[Entry], float | None]
+    goal: Callable[[LogEntry], float | None]
     """The target of an instruction or frame in rad of the device's own shaft; None: it is no goal."""
     can: bool = False
     settles_s: float = 0.15
@@ -71,14 +71,14 @@ class RobotKind:
         """The group of each joint."""
         return [f"{self.robot.name}.{joint.name}" for joint in self.robot.joints]
 
-    def goals(self, log: Sequence[Entry], since: float, until: float) -> list[Entry]:
+    def goals(self, log: Sequence[LogEntry], since: float, until: float) -> list[LogEntry]:
         """What leads a resting joint away from where it is."""
         if not self.can:
             return [one for one in motion_writes(log, since=since, until=until) if self.goal(one) is not None]
         sent = [one for one in log if since <= one.t <= until and one.kind == "frame" and one.direction == "in"]
         return [one for one in sent if self._leads_away(log, one)]
 
-    def _leads_away(self, log: Sequence[Entry], entry: Entry) -> bool:
+    def _leads_away(self, log: Sequence[LogEntry], entry: LogEntry) -> bool:
         shaft_rad = self.goal(entry)
         if shaft_rad is None:
             return False

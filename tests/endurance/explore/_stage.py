@@ -17,7 +17,7 @@ from tests.endurance.explore._robots import KINDS, RobotKind
 from trade import Container, errors, where
 from trade.testing import MemorySystem, VirtualTime, memory_system
 from trade_drivers import AttachedRobot, attach
-from trade_hil_sim import Entry, Heal
+from trade_hil_sim import Heal, LogEntry
 
 CLIENTS: Final = ("planner", "worker")
 _TICK_S: Final = 0.01
@@ -250,7 +250,7 @@ class Stage:
             locks = self.client(system).locks()
             found += [f"{one.holder.session} still has {one.resources}" for one in locks if one.token.number]
         ended = time.monotonic()
-        logs: dict[str, Sequence[Entry]] = {group: list(bus.log.entries) for group, bus in self.buses.items()}
+        logs: dict[str, Sequence[LogEntry]] = {group: list(bus.log.entries) for group, bus in self.buses.items()}
         self.outcome.bytes = sum(map(len, logs.values()))
         found += violations(logs, self.held, self.moved, self.stopped, ended)
         for group, bus in self.buses.items():

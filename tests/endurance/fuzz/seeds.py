@@ -33,7 +33,7 @@ from trade.transport.scouting import hello
 from trade_drivers.vendors.dynamixel._wire import crc16 as dynamixel_crc
 from trade_drivers.vendors.feetech._wire import packet as feetech_packet
 from trade_gateway.cli.operation._archive import _MANIFEST as MANIFEST
-from trade_gateway.cli.operation._archive import Entry, Manifest
+from trade_gateway.cli.operation._archive import ArchivedFile, Manifest
 from trade_gateway.mcp._tools import TOOLS
 from trade_gateway.ros.ros2._node import Attachment
 from trade_hil_sim.dynamixel import encode as dynamixel_packet
@@ -155,7 +155,7 @@ def _record() -> bytes:
 
 def _backup() -> bytes:
     kept = b"system = 'lab'\n"
-    entry = Entry("config/gateway.toml", len(kept), sha256(kept).hexdigest(), 0o600, "me", "us")
+    entry = ArchivedFile("config/gateway.toml", len(kept), sha256(kept).hexdigest(), 0o600, "me", "us")
     about = Manifest(1, "0.1.0", "here", "2026-01-01T00:00:00", "config/gateway.toml", [entry])
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w") as archive:

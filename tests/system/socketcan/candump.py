@@ -11,7 +11,7 @@ import can
 
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.legs import Leg
-from trade_hil_sim import Entry, frames
+from trade_hil_sim import LogEntry, frames
 
 __all__ = ["Candump", "RecordedLeg", "cansend"]
 
@@ -56,7 +56,7 @@ class Candump:
         self.entries()
         self._lines.clear()
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LogEntry]:
         """All frames since then, those of the last moment included."""
         data = next(self._marks).to_bytes(4, "big")
         self._marker.send(can.Message(arbitration_id=_MARK, data=data, is_extended_id=False))
@@ -75,12 +75,12 @@ class Candump:
             self._lines.append(line)
         return False
 
-    def _entry(self, line: str) -> Entry:
+    def _entry(self, line: str) -> LogEntry:
         found = _LINE.match(line)
         assert found, line
         can_id, t = int(found["id"], 16), float(found["t"]) - self._ahead_s
         name, node = _meaning(can_id, found["data"]) if len(found["id"]) == 3 and not found["remote"] else ("", None)
-        return Entry(t=t, bus="candump", kind="frame", name=name, device_id=node, hex=found["data"], can_id=can_id)
+        return LogEntry(t=t, bus="candump", kind="frame", name=name, device_id=node, hex=found["data"], can_id=can_id)
 
     def __enter__(self) -> "Candump":
         return self
@@ -99,7 +99,7 @@ class RecordedLeg(Leg):
 
     candump: Candump
 
-    def frames(self, name: str | None = None, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def frames(self, name: str | None = None, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         return frames(self.candump.entries(), name, device_id=device_id, since=since)
 
 

@@ -9,7 +9,7 @@ from tests.system.socketcan.candump import RecordedLeg, cansend
 from tests.unit.drivers.conftest import Outcome
 from tests.unit.drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, KNEE, PATIENT, Leg, leg
 from trade.errors import MotionStopped
-from trade_hil_sim import Entry, frames
+from trade_hil_sim import LogEntry, frames
 
 __all__ = ["leg"]
 
@@ -36,7 +36,7 @@ def rig(recorded: RecordedLeg) -> Leg:
     return recorded
 
 
-def of(entries: list[Entry], can_id: int) -> list[bytes]:
+def of(entries: list[LogEntry], can_id: int) -> list[bytes]:
     return [entry.data for entry in entries if entry.can_id == can_id]
 
 

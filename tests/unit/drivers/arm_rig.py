@@ -13,7 +13,7 @@ from tests.unit.drivers.conftest import Outcome
 from trade.errors import DeviceSilent
 from trade_drivers import Arm, AttachedRobot
 from trade_hil_sim import Arm as SimArm
-from trade_hil_sim import Entry, UrBus, motion_writes
+from trade_hil_sim import LogEntry, UrBus, motion_writes
 
 __all__ = ["FAR", "SLOW", "ArmRig", "answers", "arm_rig", "children", "free_rig"]
 
@@ -35,7 +35,7 @@ class ArmRig:
         return self.robot
 
     @property
-    def log(self) -> list[Entry]:
+    def log(self) -> list[LogEntry]:
         return self.sim.log.entries
 
     @property
@@ -50,7 +50,7 @@ class ArmRig:
     def base_rad(self) -> float:
         return float(self.truth.positions_rad[0])
 
-    def moves(self, since: float = 0.0) -> list[Entry]:
+    def moves(self, since: float = 0.0) -> list[LogEntry]:
         return motion_writes(self.log, since=since)
 
     def set_off(self) -> Outcome:

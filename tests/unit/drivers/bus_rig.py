@@ -9,7 +9,7 @@ from tests.support.fake_container import fake_container
 from tests.support.simulated_robots import patient
 from tests.support.waiting import wait_until
 from trade_drivers import AttachedRobot, Robot, attach, parse
-from trade_hil_sim import Entry, events, motion_writes, writes
+from trade_hil_sim import LogEntry, events, motion_writes, writes
 
 
 class BusRig:
@@ -55,13 +55,13 @@ class BusRig:
         return robot
 
     @property
-    def log(self) -> list[Entry]:
+    def log(self) -> list[LogEntry]:
         return list(self.sim.log.entries)
 
-    def events(self, name: str, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def events(self, name: str, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         return events(self.log, name, device_id=device_id, since=since)
 
-    def wait_for(self, name: str, device_id: int | None = None, since: float = 0.0) -> Entry:
+    def wait_for(self, name: str, device_id: int | None = None, since: float = 0.0) -> LogEntry:
         """The first such event from then on."""
         wait_until(lambda: self.events(name, device_id, since), f"{name} of {device_id}")
         return self.events(name, device_id, since)[0]
@@ -83,11 +83,11 @@ class ServoRig(BusRig):
             return self.open(self.sim_class(servos, port, name=bus.name, paced=paced), prepare)
         return self.open(self.sim_class.from_robot(bus, self.robot.joints_on(bus.name), port, paced=paced), prepare)
 
-    def goals(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def goals(self, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         """Writes that touch a goal position."""
         return writes(self.log, device_id=device_id, register="goal_position", since=since)
 
-    def moves(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def moves(self, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         """Writes that could set something moving."""
         return motion_writes(self.log, device_id=device_id, since=since)
 

@@ -16,7 +16,7 @@ from tests.unit.drivers.gate import Gate
 from trade._context.call_context import CallContext, running
 from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot
-from trade_hil_sim import DynamixelBus, Entry, Servo
+from trade_hil_sim import DynamixelBus, LogEntry, Servo
 
 GOAL, TORQUE, WATCHDOG = 116, 64, 98
 
@@ -70,7 +70,7 @@ class Rig(ServoRig):
     original, file, sim_class, servo_class = HEAD, "head.toml", DynamixelBus, Servo
     first, second, group = "neck.pan", "neck.tilt", "head"
 
-    def goal_of(self, entry: Entry) -> int:
+    def goal_of(self, entry: LogEntry) -> int:
         return goal_counts(entry)
 
     def move_by_another(self, goal: int) -> None:
@@ -105,7 +105,7 @@ def robot(head: Rig) -> AttachedRobot:
     return head.attach()
 
 
-def goal_counts(entry: Entry) -> int:
+def goal_counts(entry: LogEntry) -> int:
     """The goal position that a write carries: always its last four bytes here."""
     return int.from_bytes(entry.data[-4:], "little", signed=True)
 

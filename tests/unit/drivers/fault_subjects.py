@@ -21,7 +21,7 @@ from tests.unit.drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceError, DeviceFault
 from trade_drivers import Arm, Motor
 from trade_drivers.vendors.ur._dashboard import ask
-from trade_hil_sim import Entry, events, instructions, motion_writes, writes
+from trade_hil_sim import LogEntry, events, instructions, motion_writes, writes
 
 __all__ = ["OWN_CLOCK", "SUBJECTS", "Subject"]
 
@@ -63,11 +63,11 @@ class Subject(ABC):
         """How much of the slow move, 0 to 1, lies behind it where it was then, or is."""
 
     @abstractmethod
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         """The commands on the wire that make it hold or stop."""
 
     @abstractmethod
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         """What the driver asked it, and it could answer."""
 
     @property
@@ -80,14 +80,14 @@ class Subject(ABC):
         return self.share(self.truth)
 
     @property
-    def log(self) -> list[Entry]:
+    def log(self) -> list[LogEntry]:
         return list(self.rig.log)
 
-    def moves(self, since: float) -> list[Entry]:
+    def moves(self, since: float) -> list[LogEntry]:
         """The commands it got that could move it."""
         return motion_writes(self.log, device_id=self.device_id, since=since)
 
-    def events(self, name: str, since: float) -> list[Entry]:
+    def events(self, name: str, since: float) -> list[LogEntry]:
         return events(self.log, name, device_id=self.device_id, since=since)
 
     def places(self, since: float) -> list[float]:
@@ -155,14 +155,14 @@ class Servo(_Joint):
     def get(self) -> Motor:
         return self.robot.motor("neck.pan")
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         return writes(self.log, device_id=self.device_id, register="goal_position", since=since)
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         asked = instructions(self.log, "sync_read", since=since)
         return [entry for entry in asked if self.device_id in (entry.ids or (entry.device_id,))]
 
-    def moves(self, since: float) -> list[Entry]:
+    def moves(self, since: float) -> list[LogEntry]:
         """A command to hold its position does not count."""
         here = self.truth.position_counts
         found = super().moves(since)
@@ -181,11 +181,11 @@ class Drive(_Joint):
     def get(self) -> Motor:
         return self.robot.motor("leg.hip")
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         reported = self.rig.frames("rpdo1", HIP, since)
         return [entry for entry in reported if int.from_bytes(entry.data[:2], "little") & HALT]
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         return self.rig.frames("tpdo1", HIP, since)
 
 
@@ -217,10 +217,10 @@ class Hand(Subject):
     def truth(self) -> Any:
         return self.rig.truth
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         return [entry for entry in self.rig.writes(since) if not entry.moves]
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         return instructions(self.log, device_id=self.device_id, since=since)
 
     def recover(self, recovery: Recovery, since: float) -> None:
@@ -237,15 +237,15 @@ class TailServo(_Joint):
     def get(self) -> Motor:
         return self.robot.motor("tail.root")
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         reported = writes(self.log, device_id=self.device_id, register="goal_speed", since=since)
         return [entry for entry in reported if int.from_bytes(entry.data[5:7], "little") == self.full_speed]
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         asked = instructions(self.log, "sync_read", since=since)
         return [entry for entry in asked if self.device_id in entry.ids]
 
-    def moves(self, since: float) -> list[Entry]:
+    def moves(self, since: float) -> list[LogEntry]:
         """A command to hold its position does not count."""
         here = self.truth.position_counts
         found = super().moves(since)
@@ -264,18 +264,18 @@ class TailMotor(_Joint):
     def get(self) -> Motor:
         return self.robot.motor("tail.root")
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         return self.rig.frames(self.rig.target, ROOT, since)
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         return [entry for entry in self.rig.frames(device_id=ROOT, since=since) if entry.direction == "out"]
 
-    def moves(self, since: float) -> list[Entry]:
+    def moves(self, since: float) -> list[LogEntry]:
         """A command to hold its position does not count."""
         here_rad = self.truth.position_rad * self.rig.robot.joints[0].gear
         return [entry for entry in super().moves(since) if not self._holds_at(entry, here_rad)]
 
-    def _holds_at(self, entry: Entry, here_rad: float) -> bool:
+    def _holds_at(self, entry: LogEntry, here_rad: float) -> bool:
         if entry.name != self.rig.target:
             return False
         [target] = struct.unpack("<f", entry.data[:4])
@@ -312,10 +312,10 @@ class ArmSubject(Subject):
     def places(self, since: float) -> list[float]:
         return [json.loads(e.detail)[0] / FAR[0] for e in events(self.log, since=since) if e.detail.startswith("[")]
 
-    def holds(self, since: float) -> list[Entry]:
+    def holds(self, since: float) -> list[LogEntry]:
         return instructions(self.log, "stop_j", since=since)
 
-    def exchanges(self, since: float) -> list[Entry]:
+    def exchanges(self, since: float) -> list[LogEntry]:
         raise NotImplementedError  # its answers are not in the log
 
     def wait_for_exchanges(self, since: float) -> None:

@@ -12,7 +12,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.bus_rig import BusRig
 from trade.errors import DeviceError
 from trade_drivers import Gripper
-from trade_hil_sim import Entry, GripperTruth, RobotiqBus, events, motion_writes, writes
+from trade_hil_sim import GripperTruth, LogEntry, RobotiqBus, events, motion_writes, writes
 
 
 class HandRig(BusRig):
@@ -35,14 +35,14 @@ class HandRig(BusRig):
         made.activate()
         return made
 
-    def moves(self, since: float = 0.0) -> list[Entry]:
+    def moves(self, since: float = 0.0) -> list[LogEntry]:
         """Writes that could set the fingers moving; those that stop them are none."""
         return motion_writes(self.log, since=since)
 
-    def writes(self, since: float = 0.0) -> list[Entry]:
+    def writes(self, since: float = 0.0) -> list[LogEntry]:
         return writes(self.log, since=since)
 
-    def wait_for(self, name: str, since: float = 0.0) -> Entry:
+    def wait_for(self, name: str, since: float = 0.0) -> LogEntry:
         """The first such event from then on."""
         wait_until(lambda: events(self.log, name, since=since), name)
         return events(self.log, name, since=since)[0]

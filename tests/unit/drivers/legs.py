@@ -12,7 +12,7 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.bus_rig import BusRig
 from trade.errors import TradeError
 from trade_drivers import Motor, Robot, parse
-from trade_hil_sim import Entry, frames
+from trade_hil_sim import LogEntry, frames
 from trade_hil_sim.cia402 import Cia402Bus
 
 LEG = """
@@ -105,7 +105,7 @@ class Leg(BusRig):
         host, _, port = address.partition(":")
         return can.Bus(interface="socketcand", host=host, port=int(port), channel=channel, tcp_tune=True)
 
-    def frames(self, name: str | None = None, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def frames(self, name: str | None = None, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         return frames(self.log, name, device_id=device_id, since=since)
 
     def controlwords(self, device_id: int, since: float = 0.0) -> list[int]:
@@ -140,7 +140,7 @@ def stop_by_nmt(leg: Leg, node: int) -> None:
         wait_until(lambda: any(e.data == b"\x04" for e in leg.frames("heartbeat", node)[-1:]), "it is stopped")
 
 
-def turned_by_another(leg: Leg, speed: int) -> Entry:
+def turned_by_another(leg: Leg, speed: int) -> LogEntry:
     """Another program has the hip turn at this speed, in the drive's unit; the entry of its start."""
     with leg.listen() as other:
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 
 from tests.unit.drivers.legs import Leg
-from trade_hil_sim import Entry
+from trade_hil_sim import LogEntry
 from trade_hil_sim.damiao import DamiaoBus
 from trade_hil_sim.odrive import OdriveBus
 
@@ -75,7 +75,7 @@ class MotorRig(Leg):
             self.sim_class.from_robot(bus, self.robot.joints_on(bus.name), self._tmp_path, paced=paced), prepare
         )
 
-    def commanded(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
+    def commanded(self, device_id: int | None = None, since: float = 0.0) -> list[LogEntry]:
         """Every frame of a client that could move something, or keeps it where it is."""
         return [e for e in self.frames(device_id=device_id, since=since) if e.name in self.orders]
 

@@ -11,7 +11,7 @@ import pytest
 from tests.support.simulated_robots import TAIL
 from tests.unit.drivers.bus_rig import ServoRig
 from trade_drivers import Motor
-from trade_hil_sim import Entry
+from trade_hil_sim import LogEntry
 from trade_hil_sim.feetech import FeetechBus, Servo
 
 __all__ = ["COUNTS_PER_RAD", "LEAD_S", "TailRig", "goal_of", "lead_counts", "measured_before", "rig", "tail"]
@@ -29,7 +29,7 @@ class TailRig(ServoRig):
     original, file, sim_class, servo_class = TAIL, "tail.toml", FeetechBus, Servo
     first, second, group = "tail.root", "tail.tip", "tail"
 
-    def goal_of(self, entry: Entry) -> int:
+    def goal_of(self, entry: LogEntry) -> int:
         return goal_of(entry)
 
     def move_by_another(self, goal: int) -> None:
@@ -48,7 +48,7 @@ class TailRig(ServoRig):
         self.servo(device_id).write(address, bytes(data), time.monotonic())
 
 
-def goal_of(entry: Entry) -> int:
+def goal_of(entry: LogEntry) -> int:
     """The goal position that a write carries."""
     assert entry.address is not None
     at = _GOAL - entry.address
@@ -60,7 +60,7 @@ def lead_counts(speed_rad_s: float, accel_rad_s2: float = 20.0) -> float:
     return max(_NEAR, (speed_rad_s * LEAD_S + speed_rad_s**2 / (2 * accel_rad_s2)) * COUNTS_PER_RAD) + 2
 
 
-def measured_before(log: list[Entry], write: Entry) -> int:
+def measured_before(log: list[LogEntry], write: LogEntry) -> int:
     """The position that the servo had last reported when this write came."""
     reported = [entry for entry in log if entry.kind == "sent" and entry.device_id == write.device_id]
     reported = [entry for entry in reported if entry.name == "sync_read" and entry.t <= write.t]

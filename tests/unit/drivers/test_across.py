@@ -14,7 +14,7 @@ from tests.unit.drivers.conftest import Outcome, call, goal_counts, written_now
 from trade import Container, errors, where
 from trade.testing import MemorySystem, memory_system
 from trade_drivers import AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach, parse
-from trade_hil_sim import DynamixelBus, Entry, events, motion_writes, writes
+from trade_hil_sim import DynamixelBus, LogEntry, events, motion_writes, writes
 
 pytestmark = pytest.mark.virtual_time
 
@@ -64,7 +64,7 @@ class Walker:
         self.attached: AttachedRobot = undo.enter_context(attach(self.robot, announced=False, ports=ports))
         self.legs: JointGroup = self.attached.group("legs")
 
-    def log(self, side: str) -> list[Entry]:
+    def log(self, side: str) -> list[LogEntry]:
         return list(self.sims[side].log.entries)
 
     def truth(self, name: str) -> float:
@@ -76,7 +76,7 @@ class Walker:
     def rests(self) -> bool:
         return all(at_rest(device) for side in ("left", "right") for device in self.sims[side].state().devices)
 
-    def moves(self, since: float = 0.0) -> list[Entry]:
+    def moves(self, since: float = 0.0) -> list[LogEntry]:
         return [entry for side in ("left", "right") for entry in motion_writes(self.log(side), since=since)]
 
 

@@ -17,9 +17,9 @@ from trade_hil_sim import (
     Command,
     Duplicate,
     Emergency,
-    Entry,
     Heal,
     Late,
+    LogEntry,
     Mute,
     Truncate,
 )
@@ -182,7 +182,7 @@ def _strike(leg: Leg, fault: str) -> None:
         leg.sim.do(order)
 
 
-def _set_up(leg: Leg, since: float) -> list[Entry]:
+def _set_up(leg: Leg, since: float) -> list[LogEntry]:
     """Frames that start the hip, with which a set-up ends."""
     return [entry for entry in leg.frames("nmt", since=since) if entry.data == bytes((1, HIP))]
 

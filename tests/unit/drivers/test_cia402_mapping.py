@@ -10,7 +10,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import HIP, KNEE, Leg, fault_of, rig
 from trade.errors import DeviceFault
 from trade_drivers.vendors.cia402 import _table as table
-from trade_hil_sim import Entry, Mute
+from trade_hil_sim import LogEntry, Mute
 
 pytestmark = [pytest.mark.virtual_time, pytest.mark.parametrize("strict", [True, False], ids=["strict", "tolerant"])]
 
@@ -27,17 +27,17 @@ def plug(rig: Leg, strict: bool) -> None:
     rig.plug(prepare=prepare)
 
 
-def mappings(leg: Leg, since: float = 0.0) -> list[Entry]:
+def mappings(leg: Leg, since: float = 0.0) -> list[LogEntry]:
     """Requests to write an object of the hip's PDOs (1400h to 1BFFh)."""
     writes = [entry for entry in leg.frames("sdo_request", HIP, since) if entry.data[0] & 0xE0 == 0x20]
     return [entry for entry in writes if 0x14 <= entry.data[2] <= 0x1B]
 
 
-def aborts(leg: Leg, since: float) -> list[Entry]:
+def aborts(leg: Leg, since: float) -> list[LogEntry]:
     return [entry for entry in leg.frames("sdo_reply", HIP, since) if entry.data[0] == 0x80]
 
 
-def optional(leg: Leg, since: float) -> list[Entry]:
+def optional(leg: Leg, since: float) -> list[LogEntry]:
     """Refusals because an object does not exist, or cannot be written."""
     return [entry for entry in aborts(leg, since) if entry.data[4:] != table.NOT_IN_THIS_STATE.to_bytes(4, "little")]
 

@@ -31,7 +31,7 @@ from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import Following, Turning
 from trade_drivers.vendors.cia402._homing import Drive
 from trade_drivers.vendors.cia402._verify import interpolation_period
-from trade_hil_sim import Entry, Mute
+from trade_hil_sim import LogEntry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 
 pytestmark = pytest.mark.virtual_time
@@ -42,7 +42,7 @@ QUICK_STOP, OPERATE = 0x02, 0x0F
 TURNING = [CYCLIC_VELOCITY, PROFILE_VELOCITY]
 
 
-def written(leg: Leg, index: int, sub: int = 0, joint: int = HIP, since: float = 0.0) -> list[Entry]:
+def written(leg: Leg, index: int, sub: int = 0, joint: int = HIP, since: float = 0.0) -> list[LogEntry]:
     """Requests to write an object."""
     place = index.to_bytes(2, "little") + bytes((sub,))
     found = leg.frames("sdo_request", joint, since)
@@ -53,7 +53,7 @@ def modes(leg: Leg, joint: int = HIP, since: float = 0.0) -> list[int]:
     return [e.data[4] for e in written(leg, 0x6060, joint=joint, since=since)]
 
 
-def shown(leg: Leg, mode: int, joint: int = HIP) -> list[Entry]:
+def shown(leg: Leg, mode: int, joint: int = HIP) -> list[LogEntry]:
     """Frames in which the drive says that it is in this mode."""
     return [e for e in leg.frames("tpdo2", joint) if e.data[4] == mode]
 

@@ -20,7 +20,7 @@ from trade.errors import DeviceFault, DeviceSilent, TradeError
 from trade_drivers import AttachedRobot, Motor, attach, parse
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import Stage
-from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, Mute, SimProcess, events, frames
+from trade_hil_sim import Absent, BrownOut, Heal, Late, LogEntry, Mute, SimProcess, events, frames
 
 pytestmark = pytest.mark.virtual_time
 
@@ -112,7 +112,7 @@ def test_a_drive_that_does_not_stay_started_is_started_again(leg: Leg) -> None:
     assert not armings(leg, sent)
 
 
-def armings(leg: Leg, since: float) -> list[Entry]:
+def armings(leg: Leg, since: float) -> list[LogEntry]:
     """Requests that write whose heartbeat the hip is to listen for (1016h)."""
     return [frame for frame in leg.frames("sdo_request", HIP, since) if frame.data[:3] == b"\x23\x16\x10"]
 
@@ -150,13 +150,13 @@ class Stand:
         self.file.write_text(LEG)
         self.sim = undo.enter_context(SimProcess(self.file, paced=False))
 
-    def events(self, name: str, since: float = 0.0) -> list[Entry]:
+    def events(self, name: str, since: float = 0.0) -> list[LogEntry]:
         return events(self.sim.entries(), name, since=since)
 
     def started(self, since: float = 0.0) -> set[int | None]:
         return {event.device_id for event in self.events("motion_started", since)}
 
-    def goals(self, since: float) -> list[Entry]:
+    def goals(self, since: float) -> list[LogEntry]:
         return [entry for entry in frames(self.sim.entries(), "rpdo1", since=since) if entry.data[0] & 1 << 4]
 
     def freeze(self, pid: int, seconds: float) -> float:

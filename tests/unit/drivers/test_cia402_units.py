@@ -26,7 +26,7 @@ from tests.unit.drivers.test_cia402_motor import through
 from trade.errors import ConfigurationError, DeviceFault, TradeError
 from trade_drivers import Tolerances
 from trade_drivers.vendors.cia402._homing import Drive
-from trade_hil_sim import Absent, BrownOut, Entry, Place, Replug, Unplug
+from trade_hil_sim import Absent, BrownOut, LogEntry, Place, Replug, Unplug
 from trade_hil_sim.cia402 import Object, factor_objects, unit_objects
 
 pytestmark = pytest.mark.virtual_time
@@ -52,7 +52,7 @@ def plug(rig: Leg, *objects: Object, **values: int) -> Any:
     return rig.drive(HIP)
 
 
-def commands(leg: Leg, since: float = 0.0) -> list[Entry]:
+def commands(leg: Leg, since: float = 0.0) -> list[LogEntry]:
     """All that has been written to the hip's drive, by frames and in its dictionary."""
     writes = [entry for entry in leg.frames("sdo_request", HIP, since) if entry.data[0] & 0xE0 == 0x20]
     return [entry for name in ("rpdo1", "rpdo2", "rpdo3", "rpdo4") for entry in leg.frames(name, HIP, since)] + writes

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from trade.errors import ConfigurationError
-from trade_drivers import Commissioner, Found, scan
+from trade_drivers import Commissioner, ScannedDevice, scan
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_drivers.vendors.feetech import FeetechDriver
 from trade_drivers.vendors.robotiq import RobotiqDriver
@@ -53,10 +53,10 @@ class Line:
         self.sim = self._undo.enter_context(self.make.bus(servos, self._tmp_path / "line", paced=False))
         self.port = str(self.sim.port)
 
-    def scan(self, *ids: int, bauds: Sequence[int] = ()) -> list[Found]:
+    def scan(self, *ids: int, bauds: Sequence[int] = ()) -> list[ScannedDevice]:
         return scan(self.commissioner, self.port, bauds or [self.make.factory_baud], ids or range(4))
 
-    def set_id(self, device_id: int, to: int) -> Found:
+    def set_id(self, device_id: int, to: int) -> ScannedDevice:
         return self.commissioner.set_id(self.port, self.make.factory_baud, device_id, to)
 
     def switch_on(self, nth: int = 0) -> None:

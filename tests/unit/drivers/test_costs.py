@@ -25,7 +25,7 @@ from tests.unit.drivers.motor_rig import DamiaoRig, OdriveRig
 from tests.unit.drivers.tail_rig import TailRig
 from trade_drivers import AttachedRobot
 from trade_drivers.plugins._driver import Driver, drivers
-from trade_hil_sim import Entry
+from trade_hil_sim import LogEntry
 
 pytestmark = pytest.mark.realtime
 
@@ -129,11 +129,11 @@ def test_a_bus_cycle_sends_a_bounded_number_of_bytes(running: Running) -> None:
         assert answered[what] <= running.loop.answered.get(what, 0) * turns, f"{what}, of {answered} in {turns} turns"
 
 
-def is_asked(one: Entry) -> bool:
+def is_asked(one: LogEntry) -> bool:
     return one.kind == "received" or (one.kind == "frame" and one.direction == "in")
 
 
-def is_answer(one: Entry) -> bool:
+def is_answer(one: LogEntry) -> bool:
     return one.kind == "sent" or (one.kind == "frame" and one.direction == "out")
 
 

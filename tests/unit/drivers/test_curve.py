@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade_drivers.motion._spline import Curve, Way, there_together
+from trade_drivers.motion._spline import Curve, JointTask, there_together
 
 ANGLES = st.floats(-3, 3)
 STEPS = st.floats(0.05, 2)
 WAYS = st.builds(
-    Way,
+    JointTask,
     start_rad=ANGLES,
     velocity_rad_s=st.just(0.0) | st.floats(-2, 2),
     goal_rad=ANGLES,
@@ -84,7 +84,7 @@ def test_two_points_at_rest_give_the_standard_cubic() -> None:
 
 
 @given(st.lists(WAYS, min_size=1, max_size=4))
-def test_joints_that_go_together_arrive_together_within_their_limits(ways: list[Way]) -> None:
+def test_joints_that_go_together_arrive_together_within_their_limits(ways: list[JointTask]) -> None:
     curves = there_together(ways)
     assert len({round(curve.duration_s, 6) for curve in curves}) == 1
     for way, curve in zip(ways, curves, strict=True):
@@ -97,8 +97,8 @@ def test_joints_that_go_together_arrive_together_within_their_limits(ways: list[
 
 
 def test_the_slowest_joint_goes_at_its_limits() -> None:
-    slow, fast = there_together([Way(0, 0, 2, 1, 4), Way(0, 0, 0.1, 1, 4)])
+    slow, fast = there_together([JointTask(0, 0, 2, 1, 4), JointTask(0, 0, 0.1, 1, 4)])
     assert slow.duration_s == pytest.approx(2 / 1 + 1 / 4)  # at speed for all of it but the two ramps
     assert fast.duration_s == slow.duration_s
-    [short] = there_together([Way(0, 0, 1, 10, 4)])
+    [short] = there_together([JointTask(0, 0, 1, 10, 4)])
     assert short.duration_s == pytest.approx(2 * math.sqrt(1 / 4))  # never gets to its speed

@@ -17,7 +17,7 @@ from tests.support.waiting import PATIENCE_S
 from trade import Resource
 from trade.errors import BusGone, DeviceFault, DeviceSilent, TradeError
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket, _drained
-from trade_drivers.bus._jobs import Device, Steps, Work
+from trade_drivers.bus._jobs import AwaitedJob, Device, Steps
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -62,7 +62,7 @@ class Exchange(BusCycle[Joint]):
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None: ...
 
 
-class Job(Work[Joint]):
+class Job(AwaitedJob[Joint]):
     """So many exchanges with its joints, of which the last may fail."""
 
     def __init__(self, model: "Model", number: int, joints: Sequence[Joint], exchanges: int, fails: bool) -> None:
@@ -84,7 +84,7 @@ class Job(Work[Joint]):
             yield
 
 
-def became_of(work: Work[Joint]) -> type[TradeError] | None:
+def became_of(work: AwaitedJob[Joint]) -> type[TradeError] | None:
     try:
         work.wait(lambda: True)
     except TradeError as error:

@@ -16,11 +16,11 @@ import pytest
 from trade.errors import DeviceFault, DeviceSilent, InvalidArgument
 from trade_drivers import FaultInfo, FaultLog, MotorState
 from trade_drivers.faults import FaultStore
-from trade_drivers.faults._trouble import Found, found_in
+from trade_drivers.faults._fault_update import DetectedFault, found_in
 
 PAN, TILT = "rosie.pan", "rosie.tilt"
-HOT = Found("overheating", "rosie.pan: overheating", "let it cool")
-LOAD = Found("overload", "rosie.pan: overload", "free it")
+HOT = DetectedFault("overheating", "rosie.pan: overheating", "let it cool")
+LOAD = DetectedFault("overload", "rosie.pan: overload", "free it")
 
 
 class Clocks:
@@ -65,11 +65,11 @@ class Bench:
         if self.log is not None:
             self.log.close()
 
-    def begin(self, found: Found = LOAD, device: str = PAN, moments: Any = ()) -> None:
+    def begin(self, found: DetectedFault = LOAD, device: str = PAN, moments: Any = ()) -> None:
         assert self.log is not None
         self.log.begin(device, found, self.clocks.wall, self.clocks.s, moments)
 
-    def end(self, found: Found = LOAD, device: str = PAN) -> None:
+    def end(self, found: DetectedFault = LOAD, device: str = PAN) -> None:
         assert self.log is not None
         self.log.end(device, found.kind, self.clocks.wall, self.clocks.s)
 
@@ -252,9 +252,9 @@ def test_a_clock_that_is_set_back_changes_neither_order_nor_durations(bench: Ben
 def test_only_so_many_are_kept_and_the_acknowledged_that_are_gone_go_first(bench: Bench) -> None:
     log = bench.open(most=3)
     for kind in ("open", "gone", "gone and seen"):
-        bench.begin(Found(kind, kind))
-    bench.end(Found("gone", ""))
-    bench.end(Found("gone and seen", ""))
+        bench.begin(DetectedFault(kind, kind))
+    bench.end(DetectedFault("gone", ""))
+    bench.end(DetectedFault("gone and seen", ""))
     log.acknowledge(next(info.id for info in log.faults() if info.kind == "gone and seen"))
     wanted: set[str] = set()
     for new, wanted in (
@@ -262,7 +262,7 @@ def test_only_so_many_are_kept_and_the_acknowledged_that_are_gone_go_first(bench
         ("b", {"open", "a", "b"}),
         ("c", {"a", "b", "c"}),
     ):
-        bench.begin(Found(new, new))
+        bench.begin(DetectedFault(new, new))
         assert {info.kind for info in log.faults()} == wanted
     assert {info.kind for info in bench.open(most=3).faults()} == wanted
 
@@ -353,7 +353,7 @@ def test_on_a_full_disk_what_was_refused_is_written_when_there_is_room(bench: Be
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (24 * 1024, hard))
         for number in range(20):
-            bench.begin(Found(f"kind {'x' * number}", "x" * 4000))
+            bench.begin(DetectedFault(f"kind {'x' * number}", "x" * 4000))
             bench.clocks.s += 1
             log.save()
             bench.written()

@@ -23,7 +23,7 @@ from tests.unit.drivers.tail_rig import COUNTS_PER_RAD as TAIL_COUNTS
 from tests.unit.drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceFault, MotionStopped
 from trade_drivers import JointGroup, Motor, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.joints import Steps, Work
+from trade_drivers.joints import AwaitedJob, Steps
 
 pytestmark = pytest.mark.virtual_time
 
@@ -35,7 +35,7 @@ MOST_RAD = SPEED_RAD_S * WATCHDOG_S + 0.06
 """As far as a joint gets until its watchdog stops it, and while it brakes; at its speed it would get 0.7 rad."""
 
 
-class _HoldUp(Work[Any]):
+class _HoldUp(AwaitedJob[Any]):
     """Work in the middle of a cycle, after its measurements, that does not come back until it is let go."""
 
     def __init__(self, motor: Any) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from tests.unit.drivers.motor_rig import ROOT, TIP, MotorRig, motor_rig, wag
 from trade.errors import ConfigurationError, WrongDevice
-from trade_drivers import Commissioner, Found, scan
-from trade_drivers.bus.can import Talk
+from trade_drivers import Commissioner, ScannedDevice, scan
+from trade_drivers.bus.can import FramesById
 from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.damiao import DamiaoDriver
 from trade_drivers.vendors.odrive import OdriveDriver
@@ -32,7 +32,7 @@ ENABLE = {"odrive": (ROOT << 5 | 7, struct.pack("<I", 8)), "damiao": (ROOT, byte
 MODELS = {"odrive": ("ODrive S1", "0.6.10"), "damiao": ("DM4310", "5014")}
 
 
-def look(rig: MotorRig, **options: Any) -> list[Found]:
+def look(rig: MotorRig, **options: Any) -> list[ScannedDevice]:
     return scan(COMMISSIONERS[rig.kind](), rig.sim.port, **options)
 
 
@@ -152,18 +152,18 @@ def test_drives_and_motors_on_one_bus_are_distinguished() -> None:
 def test_what_a_canopen_node_measures_is_no_heartbeat_of_an_odrive() -> None:
     looks_like_one = struct.pack("<IBBBx", 0, 8, 0, 1)
     measured = {12 << 5 | 1: [looks_like_one] * 3}  # 181h: of node 1
-    assert Talk(measured).odrives == {12: looks_like_one}
-    assert Talk(measured | {0x701: [b"\x05"]}).odrives == {}
-    assert Talk({56 << 5 | 1: [looks_like_one] * 3}).odrives == {56: looks_like_one}  # 701h, but eight bytes
+    assert FramesById(measured).odrives == {12: looks_like_one}
+    assert FramesById(measured | {0x701: [b"\x05"]}).odrives == {}
+    assert FramesById({56 << 5 | 1: [looks_like_one] * 3}).odrives == {56: looks_like_one}  # 701h, but eight bytes
 
 
 @pytest.mark.parametrize("data", [b"\0" * 7, struct.pack("<IBBBB", 0, 1, 0, 0, 1), struct.pack("<IBBBx", 0, 99, 0, 0)])
 def test_other_bytes_are_not_read_as_a_heartbeat(data: bytes) -> None:
-    assert Talk({5 << 5 | 1: [data, data]}).odrives == {}
+    assert FramesById({5 << 5 | 1: [data, data]}).odrives == {}
 
 
 def test_one_frame_alone_identifies_no_device() -> None:
-    assert Talk({5 << 5 | 1: [struct.pack("<IBBBx", 0, 1, 0, 0)]}).odrives == {}
+    assert FramesById({5 << 5 | 1: [struct.pack("<IBBBx", 0, 1, 0, 0)]}).odrives == {}
 
 
 def test_another_firmware_than_the_files_is_refused(motor_rig: MotorRig) -> None:

@@ -18,7 +18,7 @@ from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from tests.unit.drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceFault
 from trade_drivers import Motor
-from trade_hil_sim import Absent, BrownOut, Entry, Place, writes
+from trade_hil_sim import Absent, BrownOut, LogEntry, Place, writes
 
 pytestmark = pytest.mark.virtual_time
 
@@ -35,7 +35,7 @@ class Kind(NamedTuple):
     registers: tuple[str, str]
     """Names of those of the low and the high end."""
     addresses: tuple[int, int]
-    goal_of: Callable[[Entry], int]
+    goal_of: Callable[[LogEntry], int]
     slowest_rad_s: float
 
 

@@ -57,7 +57,7 @@ def test_S07_a_stop_waits_for_no_more_bytes_than_20_ms_carry(rig: Rig, silent: t
     assert max(waited) > 0, "no stop came while the bus was busy: this shows nothing"
 
 
-def reads(rig: Rig) -> list[trade_hil_sim.Entry]:
+def reads(rig: Rig) -> list[trade_hil_sim.LogEntry]:
     return trade_hil_sim.instructions(rig.log, "sync_read", device_id=JOINTS)
 
 

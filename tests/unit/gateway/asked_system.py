@@ -8,7 +8,7 @@ import pytest
 from trade import Resource, service
 from trade._container.system import System
 from trade.testing import MemorySystem, memory_system
-from trade_gateway.language import Lexicon, Memory, Model, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Lexicon, Memory, Model, read_lexicon
 from trade_gateway.supervisor import ChildInfo, ChildServices
 
 __all__ = ["Arm", "Eyes", "Planner", "World", "world"]
@@ -80,8 +80,8 @@ class World:
         self.asker = memory.container("asker", identity="olga")
         memory.settle()
 
-    def talk(self, lexicon: Lexicon | None = None, *, keeps: bool = True, model: Model | None = None) -> Talk:
-        return Talk(self.asker, lexicon or read_lexicon(), Memory(), keeps=keeps, model=model)
+    def talk(self, lexicon: Lexicon | None = None, *, keeps: bool = True, model: Model | None = None) -> Dialogue:
+        return Dialogue(self.asker, lexicon or read_lexicon(), Memory(), keeps=keeps, model=model)
 
     def _note(self, monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
         """The transport in memory has no links to change, and the containers of a test end with it."""

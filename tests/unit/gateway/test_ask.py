@@ -13,7 +13,7 @@ from trade import Container, service, where
 from trade.errors import ConfigurationError, InvalidArgument
 from trade.testing import MemorySystem
 from trade_gateway.cli import app
-from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Memory, NotUnderstood, read_lexicon
 
 pytestmark = pytest.mark.virtual_time
 
@@ -50,8 +50,8 @@ def robot(memory: MemorySystem) -> Container:
 
 
 @pytest.fixture
-def talk(memory: MemorySystem, robot: Container) -> Talk:
-    made = Talk(memory.container("asker"), read_lexicon(), Memory())
+def talk(memory: MemorySystem, robot: Container) -> Dialogue:
+    made = Dialogue(memory.container("asker"), read_lexicon(), Memory())
     memory.settle()
     return made
 
@@ -62,7 +62,7 @@ _NEEDS = (
 )
 
 
-def test_P58_a_dialogue_about_the_services_that_exist(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+def test_P58_a_dialogue_about_the_services_that_exist(talk: Dialogue, robot: Container, memory: MemorySystem) -> None:
     host = robot.containers()[0].host
     dialogue = [
         ("Which computers are there?", f"There is one host: {host}."),
@@ -92,7 +92,7 @@ def test_P58_a_dialogue_about_the_services_that_exist(talk: Talk, robot: Contain
 
 
 def test_P58_new_services_are_those_that_came_and_went_since_the_last_question(
-    talk: Talk, robot: Container, memory: MemorySystem
+    talk: Dialogue, robot: Container, memory: MemorySystem
 ) -> None:
     talk.say("what is new")
     other = Eyes()
@@ -105,7 +105,7 @@ def test_P58_new_services_are_those_that_came_and_went_since_the_last_question(
 
 
 def test_questions_about_lock_owners_and_faults_are_answered(
-    talk: Talk, robot: Container, memory: MemorySystem
+    talk: Dialogue, robot: Container, memory: MemorySystem
 ) -> None:
     other = memory.container("other")
     memory.settle()
@@ -120,7 +120,7 @@ def test_questions_about_lock_owners_and_faults_are_answered(
     assert talk.say("What is wrong?").text == "There is a problem: dora.head: degraded: dizzy."
 
 
-def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+def test_an_order_to_stop_stops_everything(talk: Dialogue, robot: Container, memory: MemorySystem) -> None:
     reported = talk.say("Stop everything because of smoke!")
     memory.settle()
     assert [one.reason for one in robot.estops()] == ["smoke"]
@@ -138,7 +138,7 @@ def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory:
         ("", "I do not understand that"),
     ],
 )
-def test_a_question_that_is_not_understood_lists_those_that_are(talk: Talk, sentence: str, said: str) -> None:
+def test_a_question_that_is_not_understood_lists_those_that_are(talk: Dialogue, sentence: str, said: str) -> None:
     with pytest.raises(NotUnderstood) as wrong:
         talk.say(sentence)
     assert said in str(wrong.value)
@@ -165,7 +165,7 @@ def test_a_lexicon_of_ones_own_goes_first_and_calls_what_it_names(
     (tmp_path / "own.toml").write_text(LEXICON)
     asker = memory.container("asker")
     memory.settle()
-    talk = Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory())
+    talk = Dialogue(asker, read_lexicon(tmp_path / "own.toml"), Memory())
     assert talk.say("Look -0.25 rad to the left!", confirmed=True).text == "I look at -0.25 rad."
     assert talk.say("do you see a cup?").text == "About the cup: true."
     assert talk.say("Do you see a teddy bear?").text == "About the teddy bear: false."
@@ -179,7 +179,7 @@ def test_a_lexicon_can_do_no_more_than_the_service_takes(
     asker = memory.container("asker")
     memory.settle()
     with pytest.raises(InvalidArgument):
-        Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory()).say("turn the head to 0.1", confirmed=True)
+        Dialogue(asker, read_lexicon(tmp_path / "own.toml"), Memory()).say("turn the head to 0.1", confirmed=True)
 
 
 PHRASE = '[[phrase]]\nhear = ["hello {name}"]\n'

@@ -11,7 +11,7 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.gateway.asked_system import World, world
 from trade.errors import ConfigurationError
-from trade_gateway.language import Memory, Model, NotUnderstood, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Memory, Model, NotUnderstood, read_lexicon
 
 __all__ = ["world"]
 
@@ -38,9 +38,9 @@ def recorded(tmp_path: Path) -> Recorded:
     return model
 
 
-def talk_with(world: World, model: Model, shown: list[str] | None = None) -> Talk:
+def talk_with(world: World, model: Model, shown: list[str] | None = None) -> Dialogue:
     show = [].append if shown is None else shown.append
-    return Talk(world.asker, read_lexicon(), Memory(), keeps=True, model=model, show=show)
+    return Dialogue(world.asker, read_lexicon(), Memory(), keeps=True, model=model, show=show)
 
 
 def nothing_happened(world: World) -> bool:

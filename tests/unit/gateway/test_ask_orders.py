@@ -9,7 +9,7 @@ from tests.unit.gateway.asked_system import Arm, World, world
 from tests.unit.gateway.test_ask_sentences import sentences
 from trade import service, where
 from trade.errors import AccessDenied, LockedByOther, LockLost, NotInstantiable
-from trade_gateway.language import NotUnderstood, Talk, read_lexicon
+from trade_gateway.language import Dialogue, NotUnderstood, read_lexicon
 from trade_gateway.language import _dialogue as dialogue
 from trade_gateway.language._catalogue import REQUESTS
 
@@ -20,7 +20,7 @@ __all__ = ["world"]
 POLICY = policy_text("olga=viewer tester=robot", viewer="read=*", robot="register=*")
 
 
-def refused(talk: Talk, sentence: str) -> str:
+def refused(talk: Dialogue, sentence: str) -> str:
     with pytest.raises(NotUnderstood) as error:
         talk.say(sentence)
     return str(error.value)

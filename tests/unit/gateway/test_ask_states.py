@@ -7,7 +7,7 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.gateway.asked_system import Arm, World, world
 from trade import where
-from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Memory, NotUnderstood, read_lexicon
 
 pytestmark = pytest.mark.virtual_time
 
@@ -52,7 +52,7 @@ def test_the_audit_names_who_stopped_it_last(start_container, system: str, tmp_p
     robot.register(Arm("left", calls), "rosie.left.arm")
     asker = start_container("asker")
     asker.stop("rosie.left.arm")
-    talk = Talk(asker, read_lexicon(), Memory(), audit=tmp_path / "audit")
+    talk = Dialogue(asker, read_lexicon(), Memory(), audit=tmp_path / "audit")
     wait_until(lambda: "the audit has a call" in talk.say("why is the left arm stopped").text)
     assert "rosie.left.arm.stop by" in talk.say("why is the left arm stopped").text
 

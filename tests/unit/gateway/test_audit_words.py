@@ -12,7 +12,7 @@ from msgspec import structs
 from typer.testing import CliRunner
 
 from trade._audit.hash_chain import AuditRow
-from trade._audit.store import AuditStore, Keep
+from trade._audit.store import AuditStore, Retention
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
@@ -201,7 +201,7 @@ def test_a_noted_head_that_was_dropped_since_is_said_to_prove_nothing(folder: Pa
     noted.write_text(trade("audit", "head", folder, "--json").stdout)
     store = AuditStore(folder / "arm.sqlite")
     store.add([row("rosie.arm.later", time.time()) for _ in range(5)])
-    assert store.drop(Keep(days=1, rows=2, least=0, piece=6), row("", time.time())) == 6
+    assert store.drop(Retention(days=1, rows=2, least=0, piece=6), row("", time.time())) == 6
     store.close()
     done = trade("audit", "verify", folder, "--against", noted)
     assert done.exit_code == 3

@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, WireError, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
+from trade_gateway.cli.hardware._calibrate import Sweep, TravelEnds, _measure, homed, measured, with_values
 from trade_gateway.terminal._output import Output
 from trade_hil_sim import DynamixelBus, writes
 
@@ -27,11 +27,11 @@ def joint(**changes: Any) -> Joint:
 
 
 def test_the_zero_becomes_the_offset_and_the_range_ends_inside_of_what_was_reached() -> None:
-    assert measured(joint(), 0.5, Ends(-1.0, 1.5, 0.0)) == {"offset_rad": -0.5, "min_rad": -1.48, "max_rad": 0.98}
+    assert measured(joint(), 0.5, TravelEnds(-1.0, 1.5, 0.0)) == {"offset_rad": -0.5, "min_rad": -1.48, "max_rad": 0.98}
 
 
 def test_a_joint_that_turns_against_its_device_keeps_its_sense() -> None:
-    assert measured(joint(reversed=True), 0.5, Ends(-1.0, 1.5, 0.0)) == {
+    assert measured(joint(reversed=True), 0.5, TravelEnds(-1.0, 1.5, 0.0)) == {
         "offset_rad": 0.5,
         "min_rad": -0.98,
         "max_rad": 1.48,
@@ -39,13 +39,13 @@ def test_a_joint_that_turns_against_its_device_keeps_its_sense() -> None:
 
 
 def test_a_range_alone_is_measured_from_the_zero_that_the_file_has() -> None:
-    assert measured(joint(offset_rad=0.25), None, Ends(-1.0, 1.0, 0.0)) == {"min_rad": -0.73, "max_rad": 1.23}
+    assert measured(joint(offset_rad=0.25), None, TravelEnds(-1.0, 1.0, 0.0)) == {"min_rad": -0.73, "max_rad": 1.23}
     assert measured(joint(), 0.0, None) == {"offset_rad": 0.0}
 
 
 def test_a_joint_that_was_hardly_moved_gets_no_range() -> None:
     with pytest.raises(ConfigurationError, match="from one end to the other"):
-        measured(joint(), None, Ends(0.0, 0.05, 0.0))
+        measured(joint(), None, TravelEnds(0.0, 0.05, 0.0))
 
 
 PLACE = "neck.pan (id 1 on /dev/ttyUSB0)"
@@ -82,12 +82,12 @@ def done_after(looks: int) -> Callable[[], bool]:
 
 def test_a_sweep_knows_both_ends_and_where_it_stopped() -> None:
     ends = Sweep(Hand([0.0, 1.0, -2.0, 0.5]), 1, PLACE).until(done_after(3), 60.0)  # type: ignore[arg-type]
-    assert ends == Ends(-2.0, 1.0, 0.5)
+    assert ends == TravelEnds(-2.0, 1.0, 0.5)
 
 
 def test_answers_that_are_missed_for_a_moment_throw_nothing_away() -> None:
     ends = Sweep(Loose([0.0, 1.0, -2.0], 10), 1, PLACE).until(done_after(2), 60.0)  # type: ignore[arg-type]
-    assert ends == Ends(-2.0, 1.0, -2.0)
+    assert ends == TravelEnds(-2.0, 1.0, -2.0)
 
 
 def test_a_device_that_stops_answering_is_named_once_with_its_port() -> None:

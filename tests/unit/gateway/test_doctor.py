@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from tests.support.simulated_robots import HAND, HEAD, TAIL
 from tests.unit.drivers.test_second_reader import HOLDS, other_program
 from trade.transport.endpoints import free_endpoint
-from trade_drivers import CanBus, Found, parse
+from trade_drivers import CanBus, ScannedDevice, parse
 from trade_drivers.bus.can import ErrorState, Link
 from trade_drivers.plugins._ports import SeenPorts
 from trade_gateway.cli import app
@@ -51,7 +51,7 @@ def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> Non
 
 def test_an_uncalibrated_joint_is_reported_with_the_command_that_measures_it() -> None:
     text = first_file(
-        [("/dev/ttyUSB0", Found(driver="dynamixel", baud=57600, id=1, model="XL430-W250"))], Path("new.toml")
+        [("/dev/ttyUSB0", ScannedDevice(driver="dynamixel", baud=57600, id=1, model="XL430-W250"))], Path("new.toml")
     )
     found = only(robots.unmeasured(parse(text, "new.toml"), Path("new.toml")))
     assert (found.level, found.about, found.fix) == ("warning", "joint1_1", "trade calibrate new.toml joint1_1")

@@ -6,7 +6,7 @@ import pytest
 
 from trade import Container, where
 from trade.transport.endpoints import free_endpoint
-from trade.transport.interfaces import Own, own_addresses
+from trade.transport.interfaces import OwnAddress, own_addresses
 from trade_gateway.cli.hardware import _doctor_host as host
 
 pytestmark = pytest.mark.virtual_time
@@ -23,7 +23,7 @@ def test_a_container_whose_host_has_other_addresses_than_at_its_start_is_named(
     assert member.find(where(name="network", container="rosie"), wait_s=20)().listens == list(robot.settings.listen)
     assert not [found for found in host.in_sight(member, "lab") if found.level != "ok"]
     before = own_addresses()
-    monkeypatch.setattr("trade.transport.zenoh_links.own_addresses", lambda: [*before, Own("10.9.0.9", 24, 2)])
+    monkeypatch.setattr("trade.transport.zenoh_links.own_addresses", lambda: [*before, OwnAddress("10.9.0.9", 24, 2)])
     [found] = [found for found in host.in_sight(member, "lab") if found.level != "ok"]
     assert (found.level, found.about) == ("warning", "rosie")
     assert "other addresses than when it started" in found.text

@@ -9,7 +9,19 @@ import msgspec
 import pytest
 
 from trade_checks._cases import chosen
-from trade_checks.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
+from trade_checks.drill import (
+    SCENES,
+    Report,
+    Scene,
+    SceneReport,
+    Stop,
+    Target,
+    _runner,
+    as_data,
+    page,
+    play,
+    targets_of,
+)
 from trade_checks.drill._runner import DrillFailed
 from trade_checks.drill._scenes import ALLOWANCE_S, limit_s
 from trade_checks.drill._testbed import Judge
@@ -119,8 +131,8 @@ def test_the_judge_reads_a_log_while_it_is_written(tmp_path: Path) -> None:
 
 
 def _report(*stops: Stop, problems: tuple[str, ...] = ()) -> Report:
-    played = Played(scene="unplug", what="a <b>", shows="S06", stops=list(stops), problems=list(problems))
-    good = Played(scene="partition", what="cut", shows="S05", stops=[_stop(1.0)])
+    played = SceneReport(scene="unplug", what="a <b>", shows="S06", stops=list(stops), problems=list(problems))
+    good = SceneReport(scene="partition", what="cut", shows="S05", stops=[_stop(1.0)])
     return Report(
         robot="rosie",
         file="r.toml",

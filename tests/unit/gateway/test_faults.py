@@ -7,14 +7,14 @@ import pytest
 
 from tests.support.simulated_robots import HAND, HEAD
 from trade_drivers import FaultLog, parse
-from trade_drivers.faults._trouble import Found
+from trade_drivers.faults._fault_update import DetectedFault
 from trade_gateway.cli.robots._up import FaultWatch
 from trade_gateway.terminal._output import Output
 
-OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
-BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")
-SILENT = Found("silent", "rosie.pan did not answer")
-PROTECTIVE = Found("protective stop", "rosie.pan: protective stop", "call unlock_protective_stop()")
+OVERLOAD = DetectedFault("overload", "rosie.pan: overload", "remove the cause")
+BLOCKED = DetectedFault("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")
+SILENT = DetectedFault("silent", "rosie.pan did not answer")
+PROTECTIVE = DetectedFault("protective stop", "rosie.pan: protective stop", "call unlock_protective_stop()")
 BEGIN: dict[str, tuple[Any, str]] = {
     "overload": (OVERLOAD, "rosie.pan: overload. When you have looked: trade call rosie.pan.enable"),
     "blocked": (BLOCKED, "rosie.pan: is it blocked? When you have looked: trade call rosie.pan.enable"),
@@ -37,7 +37,7 @@ def reported(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("found", "line"), BEGIN.values(), ids=BEGIN)
 def test_each_change_is_reported_once_in_both_directions(
-    found: Found, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
+    found: DetectedFault, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     watch, out = FaultWatch(ROBOT, lambda: log.faults(open_only=True)), Output(as_json=True)
     assert not watch.report(out)

@@ -23,7 +23,7 @@ from trade.errors import ConfigurationError
 from trade.transport.endpoints import loopback_interface
 from trade_gateway.cli import app
 from trade_gateway.cli.robots import _gateway
-from trade_gateway.cli.robots._file_changes import Named, digest, named_by
+from trade_gateway.cli.robots._file_changes import FileDigests, digest, named_by
 from trade_gateway.config import _gateway_file
 from trade_gateway.config._children import Child
 from trade_gateway.config._gateway_file import read_gateway_file
@@ -334,7 +334,7 @@ def test_a_change_is_seen_in_the_file_the_policy_the_revoked_names_and_the_certi
 
 
 def test_changes_are_reported_by_name(file: Path) -> None:
-    def named() -> Named:
+    def named() -> FileDigests:
         return named_by(file, read_gateway_file(file))
 
     before = named()

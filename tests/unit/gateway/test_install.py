@@ -18,7 +18,7 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.operation import _install
 from trade_gateway.cli.operation._install import _closed_to
-from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, Needs, needs_of, unit_text
+from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, HostResources, needs_of, unit_text
 
 pytestmark = pytest.mark.virtual_time
 
@@ -72,7 +72,7 @@ def rules(root: Path) -> Path:
     return root / "etc" / "udev" / "rules.d" / "60-trade.rules"
 
 
-def a_unit(needs: Needs = Needs(), gateway: str = "/etc/trade/gateway.toml", **parts: object) -> str:  # noqa: B008 - frozen
+def a_unit(needs: HostResources = HostResources(), gateway: str = "/etc/trade/gateway.toml", **parts: object) -> str:  # noqa: B008 - frozen
     usual = {"user": "trade", "containers": 0, "program": ["/opt/trade/bin/trade"], "folders": [], "records": []}
     return unit_text(Path(gateway), needs=needs, **{**usual, **parts})  # type: ignore[arg-type]
 
@@ -216,7 +216,7 @@ def test_a_port_that_stays_where_it_is_is_allowed_by_its_name(tmp_path: Path) ->
     slow = (EXAMPLES / "legs.toml").read_text().replace('"socketcan"', '"slcan"').replace('"can0"', '"/dev/ttyACM3"')
     legs.write_text(slow)
     assert needs_of(map(load, (robot, eye))).devices == ("char-ttyUSB", "char-ttyACM", "/dev/ttyAMA0", "/dev/video0")
-    assert needs_of([load(legs)]) == Needs(serial=True, devices=("char-ttyUSB", "char-ttyACM"), real_time=True)
+    assert needs_of([load(legs)]) == HostResources(serial=True, devices=("char-ttyUSB", "char-ttyACM"), real_time=True)
 
 
 def test_the_unit_exposes_needed_paths_in_hidden_folders_read_only() -> None:

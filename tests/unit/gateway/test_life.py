@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 
 from trade_gateway.config._children import Supervised
-from trade_gateway.supervisor._restart_policy import Life, State, Transition
+from trade_gateway.supervisor._restart_policy import ChildLife, State, Transition
 
 
-def life(**terms: Any) -> Life:
-    return Life(Supervised(providers=[], **{"restarts": 3, "window_s": 60.0, "answers_within_s": 4.0, **terms}))
+def life(**terms: Any) -> ChildLife:
+    return ChildLife(Supervised(providers=[], **{"restarts": 3, "window_s": 60.0, "answers_within_s": 4.0, **terms}))
 
 
-def up(**terms: Any) -> Life:
+def up(**terms: Any) -> ChildLife:
     """One that is up at 10 s."""
     made = life(**terms)
     assert made.start(0.0) is Transition.LAUNCH
@@ -195,7 +195,7 @@ def test_a_child_that_takes_too_much_memory_is_saved_ended_and_started_again() -
     assert (child.state, child.why) == (State.WAITING, "it took 600 MB of memory; it ended (exit code 0)")
 
 
-def launched(child: Life, now: float) -> float:
+def launched(child: ChildLife, now: float) -> float:
     """Starts it as soon as it is due; returns the time."""
     if child.state is State.WAITING:
         now = child.deadline

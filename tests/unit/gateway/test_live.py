@@ -67,7 +67,7 @@ def fault(text: str, about: str = "rosie.neck") -> Message:
 
 def greet_next(live: Live) -> None:
     """Wait until one more has subscribed, and greet it."""
-    wait_until(lambda: not live._newcomers._seen.empty())
+    wait_until(lambda: not live._newcomers._queue.empty())
     live.greet()
 
 

@@ -19,7 +19,7 @@ from trade_gateway.recording._channels import JointStates, Message, encoded, joi
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._motion import motions
 from trade_gateway.recording._recorder import Recorder
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 from trade_gateway.recording.commands._replay_run import chosen
 
 pytestmark = pytest.mark.virtual_time
@@ -37,7 +37,7 @@ def recording(tmp_path: Path) -> Path:
         system.settle()
         hand.activate()
         path = tmp_path / "pick.mcap"
-        with RecordingFile(path, {}) as file, Recorder(recorder, Wanted(groups=["rosie"]), ending) as running:
+        with RecordingFile(path, {}) as file, Recorder(recorder, RecordedParts(groups=["rosie"]), ending) as running:
             assert running.look() == [f"{ARM}.state", f"{HAND}.state"]
             steps = using(hand)
             running.run(file, 2.5, lambda: next(steps, None))

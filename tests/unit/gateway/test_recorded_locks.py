@@ -16,7 +16,7 @@ from trade_gateway.recording._channels import LOCKS
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._reader import entries
 from trade_gateway.recording._recorder import Recorder
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 
 pytestmark = pytest.mark.virtual_time
 
@@ -35,7 +35,10 @@ def recording_of_the_head(folder: Path) -> Path:
         robot.register(FakeJoints("rosie.back.wag"), "rosie.tail")
         system.settle()
         path = folder / "nod.mcap"
-        with RecordingFile(path, {}) as file, Recorder(recorder, Wanted(groups=["rosie.head"]), ending) as running:
+        with (
+            RecordingFile(path, {}) as file,
+            Recorder(recorder, RecordedParts(groups=["rosie.head"]), ending) as running,
+        ):
             assert running.look() == ["rosie.head.state"]
             steps = locking(planner)
             running.run(file, 7.5, lambda: next(steps, None))

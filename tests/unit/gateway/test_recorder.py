@@ -24,7 +24,7 @@ from trade_gateway.cli import app
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 from trade_gateway.recording.commands import _progress
 
 pytestmark = pytest.mark.virtual_time
@@ -139,7 +139,9 @@ def head(robot: Container, pan: Motor) -> JointGroup:
 def recorder(start_container: Callable[..., Container], head: JointGroup) -> Iterator[Recorder]:
     container = start_container("recorder")
     container.find(where(name="image"), wait_s=PATIENCE_S)
-    with Recorder(container, Wanted(groups=["rosie"], services=["rosie.elbow.st?te"]), threading.Event()) as made:
+    with Recorder(
+        container, RecordedParts(groups=["rosie"], services=["rosie.elbow.st?te"]), threading.Event()
+    ) as made:
         yield made
 
 
@@ -218,7 +220,7 @@ def test_a_client_that_traced_calls_before_continues(
     container.find(where(name="image"), wait_s=PATIENCE_S)
     sink = Sink()
     sink.enough = lambda sink: bool(sink.by_topic["/calls"])
-    with Recorder(container, Wanted(), threading.Event()) as recorder:
+    with Recorder(container, RecordedParts(), threading.Event()) as recorder:
         began = threading.Thread(target=lambda: [_move(robot, 0.2) for _ in range(3)])
         # What was noted before is not of this recording: its own thread has to have read that.
         wait_until(lambda: recorder._watch._calls._read)

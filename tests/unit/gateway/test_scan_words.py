@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError
-from trade_drivers import Found, attach, load, parse
+from trade_drivers import ScannedDevice, attach, load, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware._robot_file_template import first_file
@@ -98,8 +98,8 @@ def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: Dyna
     ],
 )
 def test_contradictions_within_one_robot_file_are_reported(second: dict[str, object], complaint: str) -> None:
-    one = Found(driver="dynamixel", baud=1_000_000, id=1, model="XL430-W250")
-    other = Found(**{"driver": "dynamixel", "baud": 1_000_000, "id": 2, "model": "XL430-W250"} | second)  # type: ignore[arg-type]
+    one = ScannedDevice(driver="dynamixel", baud=1_000_000, id=1, model="XL430-W250")
+    other = ScannedDevice(**{"driver": "dynamixel", "baud": 1_000_000, "id": 2, "model": "XL430-W250"} | second)  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match=complaint):
         first_file([("/dev/a", one), ("/dev/a", other)], Path("new.toml"))
 

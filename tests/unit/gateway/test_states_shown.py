@@ -8,9 +8,9 @@ import pytest
 from tests.support.waiting import wait_until
 from trade import Container, service, where
 from trade.testing import memory_system
-from trade.transport.memory import Kind
+from trade.transport.memory import MessageKind
 from trade_gateway.cli.services._states import State, say_state
-from trade_gateway.language import Memory, Talk, read_lexicon
+from trade_gateway.language import Dialogue, Memory, read_lexicon
 from trade_gateway.terminal._output import Output
 
 StartContainer = Callable[..., Container]
@@ -62,7 +62,7 @@ def test_states_are_objects_for_programs(looking: Container, capsys: pytest.Capt
 
 
 def test_sentences_about_links_and_switches_are_answered(looking: Container) -> None:
-    talk = Talk(looking, read_lexicon(), Memory())
+    talk = Dialogue(looking, read_lexicon(), Memory())
     said = {sentence: talk.say(sentence).text for sentence in ("what is linked?", "is discovery on in mind?")}
     assert said["what is linked?"] == "There is one link: lamps is linked with mind."
     assert said["is discovery on in mind?"] == "mind has discovery on and broadcasting off."
@@ -76,10 +76,10 @@ def test_sentences_about_links_and_switches_are_answered(looking: Container) -> 
 def test_a_container_that_has_not_listed_its_services_yet_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with memory_system() as system:
         looking = system.container("looking")
-        system.lose(lambda message: message.kind is Kind.ANSWER and message.source == "lamps")
+        system.lose(lambda message: message.kind is MessageKind.ANSWER and message.source == "lamps")
         system.container("lamps").register(Lamp(), "lamp")
         looking.find("lamp.lit")
         say_state(Output(as_json=False), looking, State.NETWORK)
         assert capsys.readouterr().err == "warning: lamps did not answer: it has not listed its services\n"
-        answer = Talk(looking, read_lexicon(), Memory()).say("is discovery on?")
+        answer = Dialogue(looking, read_lexicon(), Memory()).say("is discovery on?")
         assert "of lamps it is not known, it does not answer" in answer.text

@@ -18,7 +18,7 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
 from trade.starting import Started
 from trade_gateway.config._children import Child, Supervised
-from trade_gateway.config._entry import Entry
+from trade_gateway.config._entry import ContainerTable
 from trade_gateway.supervisor import Supervisor
 from trade_gateway.supervisor._objects import CreatedObjects
 
@@ -473,7 +473,7 @@ def _child(name: str, version: int) -> Child:
         window_s=WINDOW_S,
         answers_within_s=MISSES * QUESTION_S,
     )
-    entry = Entry(providers=[])
+    entry = ContainerTable(providers=[])
     part: Any = SimpleNamespace(name=name, words=("container", name, str(version)), environment={}, entry=entry)
     return Child(part, terms, {})
 

@@ -20,7 +20,7 @@ from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._motion import motion_of, motions
 from trade_gateway.recording._reader import entries
 from trade_gateway.recording._recorder import Recorder
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 from trade_gateway.recording._timeline import Timeline
 
 pytestmark = pytest.mark.virtual_time
@@ -81,7 +81,7 @@ def recorded(file: Path, wall: WallClock, by_s: float) -> None:
         robot.register(Motor(), "rosie.neck")
         visitor.find(where(name="state"), wait_s=5)
         ending = threading.Event()
-        recorder = undo.enter_context(Recorder(visitor, Wanted(), ending))
+        recorder = undo.enter_context(Recorder(visitor, RecordedParts(), ending))
         recorder.look()
         stepping = threading.Thread(target=_events, args=(robot, wall, by_s), name="events")
         sink = undo.enter_context(RecordingFile(file, {}))

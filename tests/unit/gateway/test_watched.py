@@ -9,7 +9,7 @@ from trade import Resource, service, where
 from trade._locks import api
 from trade.testing import MemorySystem, memory_system
 from trade_gateway.cli.watching import _watch
-from trade_gateway.cli.watching._watch import Watched
+from trade_gateway.cli.watching._watch import WatchedSystem
 
 pytestmark = pytest.mark.virtual_time
 
@@ -39,7 +39,7 @@ def test_who_does_not_answer_has_not_given_its_locks_back(
     system.settle()
     monkeypatch.setattr(api, "_ANSWER_S", 0.2)
     monkeypatch.setattr(_watch, "_ASKED_EVERY_S", 0.0)
-    seen = Watched(looker, where(group="rosie"))
+    seen = WatchedSystem(looker, where(group="rosie"))
 
     def news() -> list[str]:
         return [one.what for one in seen.news()]

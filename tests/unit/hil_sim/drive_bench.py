@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from trade_hil_sim import Entry, Frame
+from trade_hil_sim import Frame, LogEntry
 from trade_hil_sim.cia402 import Drive, Mode, State
 
 NODE = 5
@@ -19,7 +19,7 @@ class Bench:
     def __init__(self, position_counts: float = 0.0) -> None:
         self.t = 100.0
         self.sent: list[tuple[float, Frame]] = []
-        self.log: list[Entry] = []
+        self.log: list[LogEntry] = []
         self.drive = Drive(NODE, joint="leg.knee", model=MODEL, position_counts=position_counts, t=self.t)
         self.drive.send = lambda frame, t: self.sent.append((t, frame))
         self.drive.emit = self.log.append

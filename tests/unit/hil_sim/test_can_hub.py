@@ -19,11 +19,11 @@ from trade_hil_sim import (
     Dribble,
     Duplicate,
     Echo,
-    Entry,
     Frame,
     Garbage,
     Heal,
     Late,
+    LogEntry,
     Mute,
     Replug,
     SimulationError,
@@ -45,7 +45,7 @@ class Parrot:
         self.heard: list[Frame] = []
         self.done: list[Any] = []
         self.send: Callable[[Frame, float], None]
-        self.emit: Callable[[Entry], None]
+        self.emit: Callable[[LogEntry], None]
 
     def hear(self, frame: Frame, t: float) -> None:
         self.heard.append(frame)

@@ -4,20 +4,20 @@ from pathlib import Path
 
 import pytest
 
-from trade_hil_sim import ByteLog, Entry, events, instructions, motion_writes, read_log, received, sent, writes
+from trade_hil_sim import ByteLog, LogEntry, events, instructions, motion_writes, read_log, received, sent, writes
 
 pytestmark = pytest.mark.virtual_time
 
 STORY = [
-    Entry(1.0, "neck", "received", hex="0102"),
-    Entry(1.0, "neck", "instruction", "sync_read", 254, (1, 2), address=132),
-    Entry(1.1, "neck", "sent", "sync_read", 1, hex="aa"),
-    Entry(2.0, "neck", "instruction", "write", 1, address=64, hex="01", registers=("torque_enable",), moves=True),
-    Entry(2.1, "neck", "event", "torque_on", 1, joint="neck.pan", position_counts=2048, position_rad=0.0),
-    Entry(3.0, "neck", "instruction", "write", 2, address=98, hex="0f", registers=("bus_watchdog",)),
-    Entry(4.0, "neck", "instruction", "write", 254, address=116, registers=("goal_position",), moves=True),
-    Entry(5.0, "arm", "instruction", "ping", 254),
-    Entry(6.0, "arm", "event", "at_rest", 3, position_counts=7),
+    LogEntry(1.0, "neck", "received", hex="0102"),
+    LogEntry(1.0, "neck", "instruction", "sync_read", 254, (1, 2), address=132),
+    LogEntry(1.1, "neck", "sent", "sync_read", 1, hex="aa"),
+    LogEntry(2.0, "neck", "instruction", "write", 1, address=64, hex="01", registers=("torque_enable",), moves=True),
+    LogEntry(2.1, "neck", "event", "torque_on", 1, joint="neck.pan", position_counts=2048, position_rad=0.0),
+    LogEntry(3.0, "neck", "instruction", "write", 2, address=98, hex="0f", registers=("bus_watchdog",)),
+    LogEntry(4.0, "neck", "instruction", "write", 254, address=116, registers=("goal_position",), moves=True),
+    LogEntry(5.0, "arm", "instruction", "ping", 254),
+    LogEntry(6.0, "arm", "event", "at_rest", 3, position_counts=7),
 ]
 
 

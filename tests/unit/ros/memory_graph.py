@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from trade_gateway.ros._graph import (
     Answer,
-    Ended,
     Goal,
+    GoalEnd,
     Heard,
     NodeListener,
     Outcome,
@@ -298,7 +298,7 @@ class _Pursuit:
             reported = types.from_bytes(result, types.to_bytes(result, outcome.result))
             self._ended.put(Outcome(outcome.how, reported, outcome.text))
         except Exception as error:  # noqa: BLE001 - it is sent to the caller
-            self._ended.put(Outcome(Ended.ABORTED, types.zero(result), str(error)))
+            self._ended.put(Outcome(GoalEnd.ABORTED, types.zero(result), str(error)))
 
     def feedback(self, message: Mapping[str, Any]) -> None:
         types, part = self._action.ros.types, self._action.parts[2]

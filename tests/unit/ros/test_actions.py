@@ -10,7 +10,7 @@ from tests.unit.ros.robots import PATIENCE_S, Stand, apart
 from trade import Handle, Resource, current_call, progress, service, where
 from trade.errors import Cancelled, ConfigurationError, DeviceFault, LockedByOther, MotionStopped
 from trade_drivers.testing import FakeGripper
-from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, RosRefused, RosUnreachable
 
 pytestmark = pytest.mark.virtual_time
 
@@ -37,10 +37,10 @@ class RosBase:
         self.goes.set()
         if self.holds:
             self.canceled.wait(PATIENCE_S)
-            return Outcome(Ended.CANCELED, {"driven_m": 0.5})
+            return Outcome(GoalEnd.CANCELED, {"driven_m": 0.5})
         if self.fails:
-            return Outcome(Ended.ABORTED, {"error_msg": self.fails})
-        return Outcome(Ended.SUCCEEDED, {"driven_m": goal.message["distance_m"]})
+            return Outcome(GoalEnd.ABORTED, {"error_msg": self.fails})
+        return Outcome(GoalEnd.SUCCEEDED, {"driven_m": goal.message["distance_m"]})
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ def test_a_goal_of_ros_is_a_call_with_feedback_and_a_result(stand: Stand, driver
     stand.up(TO)
     heard: list[Any] = []
     outcome = stand.node().pursue("/cart/drive", DRIVE, GO, heard.append).wait(PATIENCE_S)
-    assert (outcome.how, outcome.result["driven_m"]) == (Ended.SUCCEEDED, 2.0)
+    assert (outcome.how, outcome.result["driven_m"]) == (GoalEnd.SUCCEEDED, 2.0)
     assert driver.distances == [2.0]
     assert heard == [{"left_m": 1.0}]
     assert stand.container.locks() == []
@@ -189,7 +189,7 @@ def test_fields_with_other_names_are_mapped(stand: Stand) -> None:
     mapped = 'args = { angle_rad = "distance_m" }\nresult = { driven_m = "" }\n'
     stand.up(f'[[to_ros.action]]\nservice = "rosie.head.turn"\naction = "/turn"\ntype = "{DRIVE}"\n{mapped}')
     outcome = stand.node().pursue("/turn", DRIVE, GO).wait(PATIENCE_S)
-    assert (outcome.how, outcome.result["driven_m"]) == (Ended.SUCCEEDED, 2.0)
+    assert (outcome.how, outcome.result["driven_m"]) == (GoalEnd.SUCCEEDED, 2.0)
     assert stand.robot.head.commands == [2.0]
 
 
@@ -203,7 +203,7 @@ def test_the_end_of_the_client_stops_the_motion_and_gives_the_lock_back(stand: S
     assert lock.holder.purpose == "a goal of /cart/drive of /teleop"
     if how == "cancel":
         pursuit.cancel()
-        assert pursuit.wait(PATIENCE_S).how is Ended.CANCELED
+        assert pursuit.wait(PATIENCE_S).how is GoalEnd.CANCELED
     else:
         stand.ros.kill("/teleop")
     assert driver.stopped.wait(PATIENCE_S)
@@ -216,7 +216,7 @@ def test_S01_a_goal_for_what_another_client_has_locked_is_aborted_with_the_reaso
     other.find(where(group="cart", name="drive"), wait_s=PATIENCE_S)
     with other.lock("cart"):
         outcome = stand.node().pursue("/cart/drive", DRIVE, GO).wait(PATIENCE_S)
-    assert outcome.how is Ended.ABORTED
+    assert outcome.how is GoalEnd.ABORTED
     assert outcome.result["error_msg"].startswith("LockedByOther")
     assert driver.distances == []
 
@@ -263,7 +263,7 @@ def test_a_gripper_moves_to_a_width_or_holds_an_object(
     hand.object_width_m = object_m
     stand.up(HAND)
     outcome = gripped(stand, command)
-    assert outcome.how is Ended.SUCCEEDED
+    assert outcome.how is GoalEnd.SUCCEEDED
     assert outcome.result == {**result, "effort": command["max_effort"] or hand.limits().max_force_n}
     assert hand.went == [command["position"]]
 
@@ -271,7 +271,7 @@ def test_a_gripper_moves_to_a_width_or_holds_an_object(
 def test_the_parallel_gripper_command_has_one_joint(stand: Stand, hand: FakeGripper) -> None:
     stand.up(f'{HAND}type = "{PARALLEL}"\n')
     outcome = gripped(stand, {"name": ["hand"], "position": [0.02], "velocity": [0.05], "effort": [30.0]}, PARALLEL)
-    assert (outcome.how, outcome.result["reached_goal"]) == (Ended.SUCCEEDED, True)
+    assert (outcome.how, outcome.result["reached_goal"]) == (GoalEnd.SUCCEEDED, True)
     state = outcome.result["state"]
     assert (state["name"], state["position"], state["effort"]) == (["hand"], [0.02], [30.0])
 
@@ -291,7 +291,7 @@ def test_a_width_that_the_gripper_does_not_have_is_aborted_and_nothing_moves(
     stand: Stand, hand: FakeGripper, width_m: float
 ) -> None:
     stand.up(HAND)
-    assert gripped(stand, {"position": width_m}).how is Ended.ABORTED
+    assert gripped(stand, {"position": width_m}).how is GoalEnd.ABORTED
     assert hand.went == []
 
 
@@ -301,6 +301,6 @@ def test_canceling_a_command_stops_the_fingers(stand: Stand, hand: FakeGripper) 
     pursuit = stand.node().pursue("/hand", COMMAND, {"command": {"position": 0.01}})
     wait_until(lambda: hand.state().moving)
     pursuit.cancel()
-    assert pursuit.wait(PATIENCE_S).how is Ended.CANCELED
+    assert pursuit.wait(PATIENCE_S).how is GoalEnd.CANCELED
     assert ("stop", None) in hand.commands
     assert hand.went == []

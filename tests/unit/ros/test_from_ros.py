@@ -13,10 +13,10 @@ from tests.unit.ros.robots import PATIENCE_S, Stand, apart
 from trade import Handle, where
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, MotionStopped, Stopped
 from trade_gateway.recording._channels import JointStates, Message
-from trade_gateway.recording._sources import Sources, Wanted
+from trade_gateway.recording._sources import RecordedParts, Sources
 from trade_gateway.recording._timeline import Timeline
 from trade_gateway.ros._goals import ACTION
-from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, RosRefused, RosUnreachable
 
 pytestmark = pytest.mark.virtual_time
 
@@ -251,12 +251,12 @@ class RosArm:
         self.goes.set()
         if self.holds:
             self.canceled.wait(PATIENCE_S)
-            return Outcome(Ended.CANCELED, {}, "canceled")
+            return Outcome(GoalEnd.CANCELED, {}, "canceled")
         if self.result:
-            return Outcome(Ended.ABORTED, self.result, "")
+            return Outcome(GoalEnd.ABORTED, self.result, "")
         self.at = tuple(goal.message["trajectory"]["points"][-1]["positions"])
         self.falls_silent = self.falls_silent or self.dies
-        return Outcome(Ended.SUCCEEDED, {})
+        return Outcome(GoalEnd.SUCCEEDED, {})
 
 
 @pytest.fixture
@@ -289,7 +289,7 @@ def test_joints_of_ros_are_recorded_with_what_ros_knows_of_them(stand: Stand, ar
     arm.speeds = speeds
     arm.tell(0.1, 0.2)
     wait_until(lambda: _state(stand) == [0.1, 0.2])
-    sources = Sources(stand.robot.container, Wanted(groups=["lab"]), threading.Event(), Timeline())
+    sources = Sources(stand.robot.container, RecordedParts(groups=["lab"]), threading.Event(), Timeline())
     sources.look()
     assert sources.labels() == ["lab.arm.state"]
     messages: list[Message] = []

@@ -12,7 +12,7 @@ from tests.unit.ros.memory_graph import MemoryGraph, MemoryRos
 from tests.unit.ros.robots import PATIENCE_S, Stand
 from trade import where
 from trade.errors import DeviceFault, ToleranceExceeded
-from trade_gateway.ros._graph import Ended, Outcome, RosRefused
+from trade_gateway.ros._graph import GoalEnd, Outcome, RosRefused
 from trade_gateway.ros_messages._conversion import ros_stamp
 
 pytestmark = pytest.mark.virtual_time
@@ -55,7 +55,7 @@ def ended(node: MemoryGraph, asked: dict[str, Any]) -> Outcome:
 def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), TO_THERE)
-    assert (outcome.how, outcome.result["error_code"]) == (Ended.SUCCEEDED, 0)
+    assert (outcome.how, outcome.result["error_code"]) == (GoalEnd.SUCCEEDED, 0)
     [plan] = arm.plans
     assert [track.limits.name for track in plan.tracks] == ["rosie.arm.a", "rosie.arm.b"]
     assert [track.curve.duration_s for track in plan.tracks] == [2.0, 2.0]
@@ -66,14 +66,14 @@ def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Limb) -> None:
 def test_the_first_point_is_where_the_joints_are_if_the_goal_begins_later(stand: Stand, arm: Limb) -> None:
     arm.at = [0.25, 0.0]
     stand.up(ARM)
-    assert ended(stand.node(), goal((1.0, [0.5, 0.5]))).how is Ended.SUCCEEDED
+    assert ended(stand.node(), goal((1.0, [0.5, 0.5]))).how is GoalEnd.SUCCEEDED
     assert [track.curve.at(0.0)[0] for track in arm.plans[0].tracks] == [0.25, 0.0]
 
 
 def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, arm: Limb) -> None:
     stand.up(ARM + 'joints = { shoulder = "rosie.arm.a" }\n')
     asked = goal((0.0, [0.0, 0.0]), (2.0, [-0.5, 0.5]), names=("b", "shoulder"))
-    assert ended(stand.node(), asked).how is Ended.SUCCEEDED
+    assert ended(stand.node(), asked).how is GoalEnd.SUCCEEDED
     assert arm.at == pytest.approx([0.5, -0.5])
 
 
@@ -89,14 +89,14 @@ def profile(*points: tuple[float, float, float, float]) -> dict[str, Any]:
 def test_a_last_speed_that_no_joint_resolves_is_rest(stand: Stand, arm: Limb, last_rad_s: float) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), profile((0.0, 0.0, 0.0, 1.0), (2.0, 0.5, last_rad_s, -1.0)))
-    assert (outcome.how, outcome.result["error_string"]) == (Ended.SUCCEEDED, "")
+    assert (outcome.how, outcome.result["error_string"]) == (GoalEnd.SUCCEEDED, "")
     assert arm.at == pytest.approx([0.5, 0.5])
 
 
 @pytest.mark.parametrize("first_s", [1e-9, 9e-4])
 def test_a_first_point_that_is_almost_at_0_s_is_the_first(stand: Stand, arm: Limb, first_s: float) -> None:
     stand.up(ARM)
-    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is Ended.SUCCEEDED
+    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is GoalEnd.SUCCEEDED
     assert [track.curve.at(0.0)[0] for track in arm.plans[0].tracks] == [0.0, 0.0]
     assert [len(track.curve.pieces) for track in arm.plans[0].tracks] == [1, 1]
 
@@ -104,7 +104,7 @@ def test_a_first_point_that_is_almost_at_0_s_is_the_first(stand: Stand, arm: Lim
 @pytest.mark.parametrize("first_s", [1e-3, 0.05])
 def test_a_first_point_later_than_that_begins_with_the_way_there(stand: Stand, arm: Limb, first_s: float) -> None:
     stand.up(ARM)
-    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is Ended.SUCCEEDED
+    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is GoalEnd.SUCCEEDED
     assert [len(track.curve.pieces) for track in arm.plans[0].tracks] == [2, 2]
 
 
@@ -120,7 +120,7 @@ def test_S22_a_last_speed_and_accelerations_are_refused_with_joint_and_size(
 ) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), profile((0.0, 0.0, 0.0, 0.0), (2.0, 0.5, last_rad_s, accel)))
-    assert outcome.how is Ended.ABORTED
+    assert outcome.how is GoalEnd.ABORTED
     assert says in outcome.result["error_string"]
     assert arm.plans == []
 
@@ -137,7 +137,7 @@ def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
 ) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), asked)
-    assert (outcome.how, outcome.result["error_code"]) == (Ended.ABORTED, code)
+    assert (outcome.how, outcome.result["error_code"]) == (GoalEnd.ABORTED, code)
     assert says in outcome.result["error_string"]
     assert arm.plans == []
 
@@ -232,7 +232,7 @@ def test_a_failure_during_a_trajectory_ends_with_its_published_error_code(
     arm.error = error
     stand.up(ARM)
     outcome = ended(stand.node(), TO_THERE)
-    assert (outcome.how, outcome.result["error_code"]) == (Ended.ABORTED, code)
+    assert (outcome.how, outcome.result["error_code"]) == (GoalEnd.ABORTED, code)
     assert type(error).__name__ in outcome.result["error_string"]
 
 
@@ -241,7 +241,7 @@ def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Limb) -> None:
     tolerance = [{"name": "a", "position": 0.1}, {"name": "b", "position": 0.05, "velocity": 1.0}]
     off = [{"name": "a", "position": -1.0}]
     asked = {**TO_THERE, "path_tolerance": tolerance, "goal_tolerance": off, "goal_time_tolerance": ros_stamp(2.5)}
-    assert ended(stand.node(), asked).how is Ended.SUCCEEDED
+    assert ended(stand.node(), asked).how is GoalEnd.SUCCEEDED
     reported = arm.plans[0].tolerances
     assert (reported.path_rad, reported.goal_rad, reported.goal_time_s) == (0.05, 0.03, 2.5)
 
@@ -254,7 +254,7 @@ def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Limb)
     [lock] = stand.container.locks()
     assert lock.holder.purpose == "a trajectory of /teleop"
     pursuit.cancel()
-    assert pursuit.wait(PATIENCE_S).how is Ended.CANCELED
+    assert pursuit.wait(PATIENCE_S).how is GoalEnd.CANCELED
     assert arm.stopped.is_set()
     assert stand.container.locks() == []
 
@@ -267,8 +267,8 @@ def test_a_goal_that_takes_the_place_of_another_one_is_not_stopped_with_it(stand
     assert arm.goes.wait(PATIENCE_S)
     arm.hold = False
     second = node.pursue("/arm/follow", ACTION, goal((1.0, [0.3, 0.3])))
-    assert first.wait(PATIENCE_S).how is Ended.CANCELED
-    assert second.wait(PATIENCE_S).how is Ended.SUCCEEDED
+    assert first.wait(PATIENCE_S).how is GoalEnd.CANCELED
+    assert second.wait(PATIENCE_S).how is GoalEnd.SUCCEEDED
     assert arm.at == pytest.approx([0.3, 0.3])
 
 
@@ -288,7 +288,7 @@ def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Limb) -> None:
     stand.memory.settle()
     with person.lock(where(group="rosie.arm"), purpose="to repair it"):
         outcome = ended(stand.node(), TO_THERE)
-    assert outcome.how is Ended.ABORTED
+    assert outcome.how is GoalEnd.ABORTED
     assert "LockedByOther" in outcome.result["error_string"]
     assert "to repair it" in outcome.result["error_string"]
     assert arm.plans == []
@@ -300,7 +300,7 @@ def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Limb) -> None:
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
     assert arm.goes.wait(PATIENCE_S)
     report = stand.robot.container.estop("smoke")
-    assert pursuit.wait(PATIENCE_S).how is not Ended.CANCELED
+    assert pursuit.wait(PATIENCE_S).how is not GoalEnd.CANCELED
     assert arm.stopped.is_set()
     assert "Stopped" in ended(stand.node("/again"), TO_THERE).result["error_string"]
     stand.robot.container.estop_clear([report.id])
@@ -318,7 +318,7 @@ def test_what_is_said_of_the_way_is_feedback(stand: Stand, arm: Limb) -> None:
     arm.stream = reported  # type: ignore[method-assign]
     stand.up(ARM)
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE, heard.append)
-    assert pursuit.wait(PATIENCE_S).how is Ended.SUCCEEDED
+    assert pursuit.wait(PATIENCE_S).how is GoalEnd.SUCCEEDED
     assert heard[0]["joint_names"] == ["a", "b"]
     assert heard[0]["error"]["positions"] == [-0.125, 0.0]
 

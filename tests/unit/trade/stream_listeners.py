@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from trade import Container, Handle, Sample, Stream, service, where
-from trade.transport.memory import InFlightMessage, Kind
+from trade.transport.memory import InFlightMessage, MessageKind
 
 PATIENCE_S = 20.0
 """How long a test waits for what must come; far above what it takes."""
@@ -66,7 +66,11 @@ def some(stream: Stream, count: int) -> list[Sample]:
 
 def is_sample(passage: InFlightMessage) -> bool:
     """One that is sent from one container to another."""
-    return passage.key.startswith("stream/") and passage.kind not in (Kind.RISE, Kind.FALL) and not passage.arrived
+    return (
+        passage.key.startswith("stream/")
+        and passage.kind not in (MessageKind.RISE, MessageKind.FALL)
+        and not passage.arrived
+    )
 
 
 def numbers(samples: list[Sample]) -> list[int]:

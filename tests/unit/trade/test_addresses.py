@@ -11,7 +11,7 @@ from trade._discovery.dialer import Dialer
 from trade._threads.scheduler import Scheduler
 from trade.transport.addresses import Attempts
 from trade.transport.endpoints import Endpoint
-from trade.transport.zenoh_links import Joined, Links
+from trade.transport.zenoh_links import LinkAttempt, Links
 
 pytestmark = pytest.mark.virtual_time
 
@@ -132,9 +132,9 @@ class Cable:
     def __init__(self) -> None:
         self.to: set[str] = set()
 
-    def join(self, endpoint: str, *_: object) -> Joined:
+    def join(self, endpoint: str, *_: object) -> LinkAttempt:
         self.to.add(endpoint)
-        return Joined(f"session-of-{endpoint}")
+        return LinkAttempt(f"session-of-{endpoint}")
 
     def linked(self, session: str) -> bool:
         return any(f"session-of-{endpoint}" == session for endpoint in self.to)

@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 
 from trade._audit.hash_chain import NOTHING, AuditRow, ChainCheck, Head, Link, row_hash, verify
-from trade._audit.store import AuditStore, Keep, reading
+from trade._audit.store import AuditStore, Retention, reading
 
 DAY_NS = 86_400_000_000_000
 
@@ -148,7 +148,7 @@ def test_the_hash_covers_every_field_and_the_row_before() -> None:
 
 
 def test_rows_beyond_the_most_go_by_whole_pieces_and_the_rest_still_verifies(path: Path, store: AuditStore) -> None:
-    keep = Keep(days=1, rows=9, least=0, piece=5)
+    keep = Retention(days=1, rows=9, least=0, piece=5)
     assert store.drop(keep, row("", at_ns=2)) == 10
     found = verdict(path)
     assert (found.problem, found.first, found.rows) == ("", 11, 11)
@@ -158,7 +158,7 @@ def test_rows_beyond_the_most_go_by_whole_pieces_and_the_rest_still_verifies(pat
 
 def test_old_rows_go_and_young_ones_stay(path: Path, store: AuditStore) -> None:
     store.add([row("rosie.young", at_ns=3 * DAY_NS) for _ in range(10)])
-    keep = Keep(days=2, rows=1000, least=0, piece=5)
+    keep = Retention(days=2, rows=1000, least=0, piece=5)
     assert store.drop(keep, row("", at_ns=4 * DAY_NS)) == 20
     found = verdict(path)
     assert (found.problem, found.first) == ("", 21)
@@ -166,13 +166,13 @@ def test_old_rows_go_and_young_ones_stay(path: Path, store: AuditStore) -> None:
 
 
 def test_a_clock_far_ahead_does_not_clear_the_record(path: Path, store: AuditStore) -> None:
-    assert store.drop(Keep(days=2, rows=1000, least=15, piece=5), row("", at_ns=40_000 * DAY_NS)) == 5
-    assert store.drop(Keep(days=2, rows=1000, least=16, piece=5), row("", at_ns=40_000 * DAY_NS)) == 0
+    assert store.drop(Retention(days=2, rows=1000, least=15, piece=5), row("", at_ns=40_000 * DAY_NS)) == 5
+    assert store.drop(Retention(days=2, rows=1000, least=16, piece=5), row("", at_ns=40_000 * DAY_NS)) == 0
     assert verdict(path).problem == ""
 
 
 def test_rows_deleted_without_a_record_of_it_are_detected(path: Path, store: AuditStore) -> None:
-    store.drop(Keep(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
+    store.drop(Retention(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
     tamper(path, "DELETE FROM record WHERE seq < 14")
     assert verdict(path).broken_at == 1
     assert "no row says" in verdict(path).problem
@@ -180,7 +180,7 @@ def test_rows_deleted_without_a_record_of_it_are_detected(path: Path, store: Aud
 
 def test_the_row_that_records_a_drop_proves_the_last_dropped_row(path: Path, store: AuditStore) -> None:
     hashes = {link.row.seq: link.hash for link in links(path)}
-    keep = Keep(days=1, rows=9, least=0, piece=5)
+    keep = Retention(days=1, rows=9, least=0, piece=5)
     assert store.drop(keep, row("", at_ns=2)) == 10
     store.add([row("rosie.on") for _ in range(5)])
     assert store.drop(keep, row("", at_ns=2)) == 5
@@ -194,7 +194,7 @@ def test_the_row_that_records_a_drop_proves_the_last_dropped_row(path: Path, sto
 
 def test_a_dropped_row_that_no_other_row_names_is_reported_as_unverifiable(path: Path, store: AuditStore) -> None:
     hashes = {link.row.seq: link.hash for link in links(path)}
-    store.drop(Keep(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
+    store.drop(Retention(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
     dropped = verdict(path, {7: hashes[7]})
     assert (dropped.problem, dropped.untold, dropped.proven) == ("", (7,), 0)
     both = verdict(path, {7: bytes(32), 12: hashes[12]})

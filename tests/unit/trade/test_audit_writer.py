@@ -14,13 +14,13 @@ import pytest
 import trade._audit.writer as writing
 from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow, ChainCheck, verify
-from trade._audit.store import AuditStore, Keep, moved_aside_in, reading
+from trade._audit.store import AuditStore, Retention, moved_aside_in, reading
 from trade._audit.writer import AuditWriter
 
 pytestmark = pytest.mark.virtual_time
 
 Eventually = Callable[[Callable[[], bool]], bool]
-KEEP = Keep(90, 1_000_000)
+KEEP = Retention(90, 1_000_000)
 
 
 def event(what: str = "rosie.step", at_ns: int = 1) -> Event:
@@ -325,7 +325,7 @@ def test_a_clock_that_jumped_far_drops_nothing_for_its_age(
     monkeypatch.setattr(writing, "_FAR_NS", 3 * 86_400 * 10**9)
     day_ns = 86_400 * 10**9
     now = [100 * day_ns]
-    writer = write(clocks=lambda: (now[0], 0), keep=Keep(1, 10**6, least=0, piece=1))
+    writer = write(clocks=lambda: (now[0], 0), keep=Retention(1, 10**6, least=0, piece=1))
     assert eventually(lambda: writer.written == 1)
     now[0] += jump_days * day_ns
     for _ in range(20):

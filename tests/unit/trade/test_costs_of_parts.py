@@ -37,7 +37,7 @@ from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
 from trade._threads import scheduler
 from trade.sharing import Border
-from trade.testing import Kind, MemorySystem, memory_system
+from trade.testing import MemorySystem, MessageKind, memory_system
 from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
@@ -70,7 +70,7 @@ class Heard:
 
     def __init__(self, system: MemorySystem) -> None:
         self._system = system
-        self.kinds: Counter[Kind] = Counter()
+        self.kinds: Counter[MessageKind] = Counter()
         self.streamed: Counter[str] = Counter()
         self.bytes = 0
         system.tap(self._hear)
@@ -78,7 +78,7 @@ class Heard:
     def _hear(self, passage: InFlightMessage) -> None:
         if passage.arrived:
             return
-        if passage.key.startswith("stream/") and passage.kind not in (Kind.RISE, Kind.FALL):
+        if passage.key.startswith("stream/") and passage.kind not in (MessageKind.RISE, MessageKind.FALL):
             self.streamed[passage.target] += 1
             return
         self.kinds[passage.kind] += 1
@@ -227,7 +227,7 @@ def test_a_notification_is_one_call_and_nothing_while_it_waits(
         third.register(Joint(), "second")
         assert reported.acquire(timeout=20)
         wait_until(lambda: standing.info().fired == 2, "its call has been answered")
-        wait_until(lambda: heard.kinds[Kind.PUT] == 2, "the answer has passed")
+        wait_until(lambda: heard.kinds[MessageKind.PUT] == 2, "the answer has passed")
     with heard.exactly():
         standing.cancel()
 
@@ -246,7 +246,9 @@ def test_a_sample_is_read_once_and_sent_once_to_each_listener(
     asked, reported = joint.asked, heard.streamed
     assert set(reported) == {ear.name for ear in ears}
     assert max(reported.values()) <= asked + 2 * listeners  # who begins to listen is given one at once
-    assert heard.kinds[Kind.PUT] <= 2 * listeners * (2 + 2 + asked // 200)  # to ask for it, again every two seconds
+    assert heard.kinds[MessageKind.PUT] <= 2 * listeners * (
+        2 + 2 + asked // 200
+    )  # to ask for it, again every two seconds
 
 
 def test_a_hook_of_the_same_container_takes_no_message_and_another_containers_one_call(
@@ -303,7 +305,7 @@ def test_a_renewal_is_one_call_to_each_container_however_many_locks(
     locks = [here.lock([move], lease_s=LONG_S).acquire() for move in moves]
     with heard.exactly(urgent=1, put=1):
         here.lock_api.lease_client._renew(locks)
-        wait_until(lambda: heard.kinds[Kind.PUT] == 1, "it has been answered")
+        wait_until(lambda: heard.kinds[MessageKind.PUT] == 1, "it has been answered")
     for lock in locks:
         lock.release()
 

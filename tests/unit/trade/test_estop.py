@@ -21,7 +21,7 @@ from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, S
 from trade.protocol.estop_messages import decode_estop_confirmed, decode_estop_order
 from trade.protocol.keys import Address, alive_key, registry_key
 from trade.protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
-from trade.testing import Kind, MemorySystem, memory_system
+from trade.testing import MemorySystem, MessageKind, memory_system
 from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
@@ -189,7 +189,7 @@ def test_S09_an_estop_without_a_driver_is_incomplete_and_repeated_until_its_limi
     system.container("planner")
     report = system.container("caller").estop(limit_s=0.35)
     assert (report.confirmed, report.missing, report.complete) == ((), (), False)
-    assert system.sent(Kind.DROPPABLE) >= 3
+    assert system.sent(MessageKind.DROPPABLE) >= 3
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -198,7 +198,7 @@ def test_S09_it_is_repeated_until_it_gets_through_a_network_that_loses_most(seed
         axes = drivers(system, "one", "two", "three")
         caller = system.container("caller")
         draw = random.Random(seed)
-        system.lose(lambda passage: passage.kind is Kind.DROPPABLE and draw.random() < 0.6)
+        system.lose(lambda passage: passage.kind is MessageKind.DROPPABLE and draw.random() < 0.6)
         report = caller.estop(limit_s=GENEROUS_S)
         assert report.complete
         assert report.confirmed == ("tester/one", "tester/three", "tester/two")
@@ -606,7 +606,7 @@ def test_S09_an_estop_causes_only_small_announcements_between_containers(system:
     caller, reported = system.container("caller"), Counter[str]()
 
     def hear(passage: InFlightMessage) -> None:
-        if passage.kind is Kind.ANNOUNCE and not passage.arrived:
+        if passage.kind is MessageKind.ANNOUNCE and not passage.arrived:
             reported[passage.source] += len(passage.payload or b"")
 
     system.tap(hear)

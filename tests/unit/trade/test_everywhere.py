@@ -11,7 +11,7 @@ import pytest
 
 from trade import Container, HookEvent, LogReader, errors, service, where
 from trade.testing import MemorySystem, memory_system
-from trade.transport.memory import InFlightMessage, Kind
+from trade.transport.memory import InFlightMessage, MessageKind
 
 pytestmark = pytest.mark.virtual_time
 
@@ -76,7 +76,7 @@ class HalfKnown:
 
 
 def _reply_of_the_robot(message: InFlightMessage) -> bool:
-    return message.kind is Kind.ANSWER and message.source == "robot"
+    return message.kind is MessageKind.ANSWER and message.source == "robot"
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import trade
-from trade import Bound, Container, Outcome, service, where
+from trade import BoundCall, Container, Outcome, service, where
 from trade.errors import InvalidArgument, NoSuchService, NotSerialisable, ServiceGone, TooManyServices
 
 pytestmark = pytest.mark.virtual_time
@@ -133,7 +133,7 @@ def test_the_same_from_asyncio(here: Container, offer: Callable[..., Any]) -> No
 def test_a_bound_call_is_a_value(here: Container) -> None:
     set_level = here.register(Lamp(), "hall")[0]
     call = set_level.bind(3, fast=True)
-    assert isinstance(call, Bound)
+    assert isinstance(call, BoundCall)
     assert call == set_level.bind(3, fast=True)
     assert call != set_level.bind(3)
     assert len({call, set_level.bind(3, fast=True)}) == 1

@@ -18,7 +18,7 @@ from trade._discovery.announcer import Announcer
 from trade.errors import ContainerLost, ServiceGone
 from trade.protocol.keys import Address
 from trade.protocol.messages import ProviderInfo, ServiceInfo
-from trade.testing import Kind, MemorySystem, memory_system
+from trade.testing import MemorySystem, MessageKind, memory_system
 from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
@@ -109,7 +109,7 @@ def test_a_call_takes_two_messages_after_the_first() -> None:
         before = system.network.sent.copy()
         for _ in range(10):
             handle(0.1)
-        assert system.network.sent - before == Counter({Kind.PUT: 20})
+        assert system.network.sent - before == Counter({MessageKind.PUT: 20})
 
 
 def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() -> None:
@@ -133,19 +133,19 @@ def test_registering_takes_one_message_for_each_other_container() -> None:
         lamp, before = Lamp(), system.network.sent.copy()
         a.register(lamp, "robot")
         a.deregister(lamp)
-        assert system.network.sent - before == Counter({Kind.ANNOUNCE: 6})
+        assert system.network.sent - before == Counter({MessageKind.ANNOUNCE: 6})
 
 
 def test_a_joining_container_is_informed_by_answers_only(lamp: Lamp) -> None:
     with memory_system() as system:
         a = system.container("a")
-        before = system.sent(Kind.ANNOUNCE)
+        before = system.sent(MessageKind.ANNOUNCE)
         b = system.container("b")
         system.settle()
         assert len(b.services(where(group="trade"))) == 2 * len(a.services(where(group="trade", container="a")))
-        assert system.sent(Kind.ANNOUNCE) == before
+        assert system.sent(MessageKind.ANNOUNCE) == before
         b.register(lamp, "robot")
-        assert system.sent(Kind.ANNOUNCE) == before + 1
+        assert system.sent(MessageKind.ANNOUNCE) == before + 1
 
 
 def test_an_unchanged_container_reports_its_revision_ever_less_often(lamp: Lamp) -> None:
@@ -252,7 +252,9 @@ def test_a_partition_of_two_leaves_calls_of_a_third_alone(pair: Pair) -> None:
 
 def losing(*payloads_of: str) -> Callable[[InFlightMessage], bool]:
     """What is announced of providers whose names begin so gets lost."""
-    return lambda passage: passage.kind is Kind.ANNOUNCE and passage.key.rpartition("/")[2].startswith(payloads_of)
+    return lambda passage: (
+        passage.kind is MessageKind.ANNOUNCE and passage.key.rpartition("/")[2].startswith(payloads_of)
+    )
 
 
 def test_a_lost_announcement_is_known_with_the_next_one() -> None:
@@ -298,9 +300,9 @@ def test_what_is_lost_with_a_whole_storm_is_one_question() -> None:
     with memory_system() as system:
         a, b = system.container("a"), system.container("b")
         random_ = random.Random(1)
-        end = system.lose(lambda passage: passage.kind is Kind.ANNOUNCE and random_.random() < 0.5)
+        end = system.lose(lambda passage: passage.kind is MessageKind.ANNOUNCE and random_.random() < 0.5)
         system.settle()
-        before = system.sent(Kind.ASK)
+        before = system.sent(MessageKind.ASK)
         with held(a):
             for number in range(200):
                 b.register(Lamp(), f"robot-{number}")
@@ -308,7 +310,7 @@ def test_what_is_lost_with_a_whole_storm_is_one_question() -> None:
         b.register(Lamp(), "last")
         system.settle()
         assert len(labels(a)) == 201
-        assert system.sent(Kind.ASK) - before <= 3
+        assert system.sent(MessageKind.ASK) - before <= 3
 
 
 @contextlib.contextmanager

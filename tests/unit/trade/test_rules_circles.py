@@ -11,7 +11,7 @@ from trade import Container, service, where
 from trade.rules import Firing
 from trade.rules import _engine as rules_module
 from trade.rules import _steps as causes
-from trade.rules._steps import LoopDetector, Mark, turns
+from trade.rules._steps import LoopDetector, RuleMark, turns
 
 pytestmark = pytest.mark.virtual_time
 
@@ -130,29 +130,29 @@ def test_many_services_that_leave_together_are_no_circle(there: Container, desk:
     assert running.rules()[0].state == "standing"
 
 
-def fire(known: LoopDetector, mark: Mark, since_ns: int = 0, ended_ns: int | None = 0) -> int:
+def fire(known: LoopDetector, mark: RuleMark, since_ns: int = 0, ended_ns: int | None = 0) -> int:
     way = known.way_to(mark, since_ns)
     known.begin(way).ended_ns = ended_ns
     return turns(way)
 
 
 def test_a_circle_of_rules_is_counted_each_time_it_closes() -> None:
-    known, a, b = LoopDetector(), Mark("a", "x"), Mark("b", "x")
+    known, a, b = LoopDetector(), RuleMark("a", "x"), RuleMark("b", "x")
     assert [fire(known, mark) for mark in (a, b, a, b, a, b, a)] == [0, 0, 1, 1, 2, 2, 3]
 
 
 def test_what_ended_long_before_led_to_nothing() -> None:
-    known, a = LoopDetector(), Mark("a", "x")
+    known, a = LoopDetector(), RuleMark("a", "x")
     late = causes.AFTERMATH_NS + 1
     assert [fire(known, a, since, since) for since in (0, late, 2 * late)] == [0, 0, 0]
 
 
 def test_what_is_under_way_may_lead_to_anything() -> None:
-    known, a, b = LoopDetector(), Mark("a"), Mark("b")
+    known, a, b = LoopDetector(), RuleMark("a"), RuleMark("b")
     fire(known, a, ended_ns=None)
     assert known.way_to(b, 10 * causes.AFTERMATH_NS) == (a, b)
 
 
 def test_the_same_rule_for_another_service_is_another_occasion() -> None:
     known = LoopDetector()
-    assert [fire(known, Mark("a", str(number))) for number in range(9)] == [0] * 9
+    assert [fire(known, RuleMark("a", str(number))) for number in range(9)] == [0] * 9

@@ -15,7 +15,7 @@ import zenoh
 
 from tests.support.waiting import wait_until
 from trade.transport.endpoints import free_endpoint, loopback_interface
-from trade.transport.interfaces import Own, is_near, own_addresses
+from trade.transport.interfaces import OwnAddress, is_near, own_addresses
 from trade.transport.scouting import Beacon, hello, read_hello, scout
 from trade.transport.zenoh import ZenohTransport, configuration
 
@@ -23,7 +23,7 @@ ID = "de88bef20f15d9afd64d6f625e211ef4"
 CAPTURED = bytes.fromhex(
     "2209f1f41e215e626f4dd6afd9150ff2be88de01137463702f3132372e302e302e313a3435363731"
 )  # of a zenoh 1.10 session with that id that listened there
-HERE = Own("127.0.0.1", 8, 1)
+HERE = OwnAddress("127.0.0.1", 8, 1)
 
 
 @pytest.fixture
@@ -92,8 +92,8 @@ def test_the_addresses_are_those_of_the_kernel() -> None:
     assert is_near("127.9.9.9")
     assert not is_near("203.0.113.7")  # of no network: for documentation
     assert not HERE.dialled
-    assert not Own("fe80::1", 64, 2).dialled
-    assert Own("10.9.0.5", 24, 2).dialled
+    assert not OwnAddress("fe80::1", 64, 2).dialled
+    assert OwnAddress("10.9.0.5", 24, 2).dialled
 
 
 def opened(leaving: ExitStack, listen: str = "") -> ZenohTransport:
@@ -109,13 +109,13 @@ def opened(leaving: ExitStack, listen: str = "") -> ZenohTransport:
 def test_a_change_of_the_addresses_that_others_dial_is_logged(
     leaving: ExitStack, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, everywhere: bool
 ) -> None:
-    known = [HERE, Own("10.9.0.5", 24, 2)]
+    known = [HERE, OwnAddress("10.9.0.5", 24, 2)]
     monkeypatch.setattr("trade.transport.zenoh_links.own_addresses", lambda: list(known))
     own = free_endpoint()
     links = opened(leaving, own.replace("127.0.0.1", "0.0.0.0") if everywhere else own).links
     links.watch_addresses()
     assert not links.moved()
-    known[1] = Own("10.9.0.9", 24, 2)
+    known[1] = OwnAddress("10.9.0.9", 24, 2)
     links.watch_addresses()
     assert links.moved() == everywhere
     assert ("the addresses of this host changed: new 10.9.0.9; gone 10.9.0.5." in caplog.text) == everywhere

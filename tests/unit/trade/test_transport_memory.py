@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from trade.testing import LossConformance, Severable, TransportConformance
 from trade.transport.base import Channel, ChannelClosed, Message
-from trade.transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
+from trade.transport.memory import Clock, InFlightMessage, MemoryTransport, MessageKind, Network
 from trade.transport.memory.keys import meet
 
 
@@ -168,14 +168,14 @@ def test_urgent_messages_overtake_all_others(room: Room) -> None:
 
 def test_what_is_put_before_the_end_of_a_transport_arrives_before_its_signs_fall(room: Room) -> None:
     room.network.delay(0.01, jitter_s=0.1)
-    seen: list[tuple[Kind, bool]] = []
+    seen: list[tuple[MessageKind, bool]] = []
     room.network.tap(lambda passage: seen.append((passage.kind, passage.arrived)))
     room.say(*"abc")
     room.one.close()
     room.network.traffic.settle()
     assert heard(room.ear) == [b"a", b"b", b"c"]
     assert heard(room.signs) == [None]
-    assert seen[-1] == (Kind.LEAVE, True)
+    assert seen[-1] == (MessageKind.LEAVE, True)
 
 
 def test_a_test_may_drive_the_time_of_other_threads(room: Room) -> None:
@@ -336,5 +336,5 @@ def test_messages_are_counted_by_kind_and_only_those_that_go_somewhere(room: Roo
     room.say("unheard", key="elsewhere")
     room.say("stop", urgent=True)
     room.other.wake("room/a", b"")
-    assert room.network.sent - before == {Kind.PUT: 2, Kind.URGENT: 1}
+    assert room.network.sent - before == {MessageKind.PUT: 2, MessageKind.URGENT: 1}
     assert Message("room/a", b"a") == room.ear.receive()

@@ -41,7 +41,7 @@ from trade.protocol.messages import (
     decode_reply,
     encode_message,
 )
-from trade.testing._ear import RecordingListener, Teller
+from trade.testing._ear import RecordingListener, RegistryResponder
 
 CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
@@ -316,8 +316,8 @@ def test_arguments_however_deep_are_refused_and_answered_also_where_one_is_secre
     strange = [b"\x91\xa1\xff", *(encode_message(value) for value in (5, "text", None, b"", {1: 2})), *DEEPER]
     for number, args in enumerate(strange):
         publisher.put(encode_message(msgspec.structs.replace(CALL, id=number, service=name, args=msgspec.Raw(args))))
-    assert eventually(lambda: replies._heard.qsize() + here.dropped_messages == len(strange))
-    for _ in range(replies._heard.qsize()):
+    assert eventually(lambda: replies._messages.qsize() + here.dropped_messages == len(strange))
+    for _ in range(replies._messages.qsize()):
         reply = decode_reply(replies.next().payload or b"")
         assert msgspec.msgpack.decode(reply.body)["type"] == "trade.errors:InvalidArgument"
     assert echo.runs == 0
@@ -380,7 +380,7 @@ def test_a_late_joiner_survives_malformed_entries_in_the_registry(
         registry_key("robot", FORGED, "P-3"): encode_message(PROVIDER),
         tally_key(FORGED): encode_message(Tally(PROTOCOL, 3)),
     }
-    Teller(raw, registry_key("*", FORGED, "*"), standing)
+    RegistryResponder(raw, registry_key("*", FORGED, "*"), standing)
     _sign = raw.appear(alive_key(FORGED))
     late = start_container("late")
     assert late.find(where(name="echo"), wait_s=20)(3) == 3
@@ -438,7 +438,7 @@ def test_an_answer_on_behalf_of_another_container_is_ignored(
         tally_key(FORGED): encode_message(Tally(PROTOCOL, 3)),
         tally_key(here.address): encode_message(Tally(PROTOCOL, 3)),
     }
-    Teller(raw, "registry/**", standing)
+    RegistryResponder(raw, "registry/**", standing)
     _sign = raw.appear(alive_key(FORGED))
     late = start_container("late")  # asks all containers
     assert late.dropped_messages == 1

@@ -187,7 +187,7 @@ def _either(virtual: Callable[..., Any], real: Callable[..., Any]) -> Callable[.
     return call
 
 
-class _Waits:
+class _PollBase:
     """What `select.poll` and `select.epoll` share."""
 
     def __init__(self, files: Descriptors) -> None:
@@ -216,14 +216,14 @@ class _Waits:
         ]
 
 
-class _Poll(_Waits):
+class _Poll(_PollBase):
     """As `select.poll`: its time is in milliseconds."""
 
     def poll(self, timeout_ms: float | None = None) -> list[tuple[int, int]]:
         return self._wait(None if timeout_ms is None or timeout_ms < 0 else timeout_ms / 1e3)
 
 
-class _Epoll(_Waits):
+class _Epoll(_PollBase):
     """As `select.epoll`: its time is in seconds."""
 
     def __init__(self, files: Descriptors, *_: int) -> None:

@@ -169,14 +169,14 @@ class _Loader:
         return getattr(self._real, name)
 
 
-class _Site(NamedTuple):
+class _ReplacedName(NamedTuple):
     """A name whose value is replaced, in a module or a class."""
 
     owner: Any
     name: str
 
 
-_sites_of: dict[str, tuple[ModuleType, list[_Site]]] = {}
+_sites_of: dict[str, tuple[ModuleType, list[_ReplacedName]]] = {}
 """What was found in each module, which is looked for once."""
 
 
@@ -192,14 +192,14 @@ def _replace_in(module: ModuleType, replacements: Replacements, undo: contextlib
         setattr(owner, name, staticmethod(stand_in) if of_class else value if stand_in is None else stand_in)
 
 
-def _sites(module: ModuleType, replacements: Replacements) -> Generator[_Site]:
+def _sites(module: ModuleType, replacements: Replacements) -> Generator[_ReplacedName]:
     for name, value in list(vars(module).items()):
         if replacements.get(value) is not None:
-            yield _Site(module, name)
+            yield _ReplacedName(module, name)
         elif issubclass(type(value), type) and value.__module__ == module.__name__:
             for of_class, one in list(vars(cast("type", value)).items()):
                 if replacements.get(one) is not None:
-                    yield _Site(value, of_class)
+                    yield _ReplacedName(value, of_class)
 
 
 def _set(owner: Any, name: str, value: Any, undo: contextlib.ExitStack) -> None:

@@ -37,7 +37,7 @@ class Deadlock(VirtualTimeError):
     """All threads wait, and no wait has a deadline; the message has the stack of each."""
 
 
-class Ended(BaseException):
+class VirtualTimeOver(BaseException):
     """Raised in threads that still run when virtual time is over, to end them."""
 
 
@@ -222,13 +222,13 @@ class Scheduler:
             self._main.gate.release()
 
     def end(self) -> None:
-        """End all threads that still run: each gets `Ended` where it waits."""
+        """End all threads that still run: each gets `VirtualTimeOver` where it waits."""
         if self._ended:
             return
         self._ended = True
         for task in list(self._tasks.values()):
             if task is not self._main:
-                task.error = Ended()
+                task.error = VirtualTimeOver()
                 with contextlib.suppress(RuntimeError):  # it is open: the thread that ran just now has opened it
                     task.gate.release()
 
@@ -237,7 +237,7 @@ class Scheduler:
     def _me(self) -> Task:
         task = self._tasks.get(_thread.get_ident())
         if self._ended:
-            raise self.interrupt or VirtualTimeError("virtual time is over") if task is self._main else Ended
+            raise self.interrupt or VirtualTimeError("virtual time is over") if task is self._main else VirtualTimeOver
         if task is not self._current:
             known = next((one for one in threading.enumerate() if one.ident == _thread.get_ident()), None)
             why = "it was there before virtual time began" if task is None else "it waits outside of virtual time"

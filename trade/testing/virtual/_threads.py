@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from trade.testing.virtual._scheduler import Ended, Scheduler, Task, WaitList
+from trade.testing.virtual._scheduler import Scheduler, Task, VirtualTimeOver, WaitList
 
 
 class Lock:
@@ -255,7 +255,7 @@ def _run_in_turn(scheduler: Scheduler, task: Task, run: Callable[[], None]) -> N
         return
     try:
         run()
-    except (Ended, SystemExit):
+    except (VirtualTimeOver, SystemExit):
         pass
     except BaseException:  # noqa: BLE001 - as a thread of threading does
         threading.excepthook(threading.ExceptHookArgs([*sys.exc_info(), threading.current_thread()]))

@@ -6,8 +6,8 @@ on real queues.
 """
 
 from trade.transport.memory.clock import Clock
-from trade.transport.memory.links import Kind
+from trade.transport.memory.links import MessageKind
 from trade.transport.memory.network import InFlightMessage, Network, Tap
 from trade.transport.memory.transport import MemoryTransport
 
-__all__ = ["Clock", "InFlightMessage", "Kind", "MemoryTransport", "Network", "Tap"]
+__all__ = ["Clock", "InFlightMessage", "MemoryTransport", "MessageKind", "Network", "Tap"]

@@ -10,7 +10,7 @@ from trade.transport.memory.node import Node
 from trade.transport.memory.traffic import Arrive, Traffic
 
 
-class Kind(enum.Enum):
+class MessageKind(enum.Enum):
     """The kind of a message between two transports."""
 
     PUT = "put"
@@ -40,13 +40,13 @@ class Lane(enum.Enum):
 
 
 _LANES: Final = {
-    Kind.PUT: Lane.DATA,
-    Kind.URGENT: Lane.URGENT,
-    Kind.DROPPABLE: Lane.URGENT,
-    Kind.ANNOUNCE: Lane.ANNOUNCEMENTS,
-    Kind.RISE: Lane.PRESENCE,
-    Kind.FALL: Lane.PRESENCE,
-    Kind.LEAVE: Lane.PRESENCE,
+    MessageKind.PUT: Lane.DATA,
+    MessageKind.URGENT: Lane.URGENT,
+    MessageKind.DROPPABLE: Lane.URGENT,
+    MessageKind.ANNOUNCE: Lane.ANNOUNCEMENTS,
+    MessageKind.RISE: Lane.PRESENCE,
+    MessageKind.FALL: Lane.PRESENCE,
+    MessageKind.LEAVE: Lane.PRESENCE,
 }
 
 
@@ -63,7 +63,7 @@ class Delay:
         return round((self.least_s + jitter_s) * 1e9)
 
 
-class Way:
+class LinkDirection:
     """One direction of a link, used under the network's lock.
 
     Messages sent during a cut wait, as on a TCP connection, and arrive after the link heals, unless the link is given
@@ -77,17 +77,17 @@ class Way:
         """The number of cuts so far; distinguishes one cut from the next."""
         self._traffic = traffic
         self._random = generator
-        self._held: list[tuple[Kind, Arrive]] = []
+        self._held: list[tuple[MessageKind, Arrive]] = []
         self._connections = itertools.count()
         self.drop()
 
-    def send(self, kind: Kind, arrive: Arrive) -> None:
+    def send(self, kind: MessageKind, arrive: Arrive) -> None:
         """Deliver a message after its delay, after earlier messages of its lane; LEAVE waits for all lanes."""
         if self.cut:
-            if kind is not Kind.DROPPABLE:
+            if kind is not MessageKind.DROPPABLE:
                 self._held.append((kind, arrive))
             return
-        behind = list(Lane) if kind is Kind.LEAVE else [_LANES[kind]]
+        behind = list(Lane) if kind is MessageKind.LEAVE else [_LANES[kind]]
         now_ns = self._traffic.clock.monotonic_ns()
         due_ns = max(now_ns + self.delay.draw_ns(self._random), *(self._last_ns[lane] for lane in behind), 0)
         if due_ns <= now_ns and not any(self._under_way[lane] for lane in behind):
@@ -126,7 +126,7 @@ class Link:
 
     def __init__(self, one: Node, other: Node, traffic: Traffic, generator: random.Random, delay: Delay) -> None:
         self.ends: Final = (one, other)
-        self.ways: Final = {node: Way(traffic, generator, delay) for node in self.ends}
+        self.ways: Final = {node: LinkDirection(traffic, generator, delay) for node in self.ends}
         """By the node that each direction starts from."""
         self.up = True
 

@@ -12,7 +12,7 @@ from typing import Final
 from trade.transport.base import Answer, ChannelClosed, Message, Question
 from trade.transport.memory.clock import Clock
 from trade.transport.memory.keys import meet
-from trade.transport.memory.links import Delay, Kind, Link, Way
+from trade.transport.memory.links import Delay, Link, LinkDirection, MessageKind
 from trade.transport.memory.node import MemoryQuestions, Node
 from trade.transport.memory.traffic import Arrive, Traffic
 from trade.transport.memory.wait_clock import MovedWaitClock
@@ -22,7 +22,7 @@ from trade.transport.memory.wait_clock import MovedWaitClock
 class InFlightMessage:
     """A message between two transports, as a tap sees it: once when it is sent, and once when it has arrived."""
 
-    kind: Kind
+    kind: MessageKind
     source: str
     """Name of the sending node."""
     target: str
@@ -60,7 +60,7 @@ class Network:
     ) -> None:
         self.clock: Final = clock or Clock()
         self.waits: Final = MovedWaitClock()
-        self.sent: Final[Counter[Kind]] = Counter()
+        self.sent: Final[Counter[MessageKind]] = Counter()
         """How many messages of each kind were sent from one transport to another."""
         self.lock: Final = threading.RLock()
         self.changed: Final = threading.Condition(self.lock)
@@ -98,7 +98,7 @@ class Network:
             for other in others:
                 for token, key in list(other.tokens.items()):
                     self.pass_on(
-                        Kind.RISE, other, node, Message(key, b""), _seeing(node, other, token, key), at_once=True
+                        MessageKind.RISE, other, node, Message(key, b""), _seeing(node, other, token, key), at_once=True
                     )
             return node
 
@@ -115,7 +115,7 @@ class Network:
             node.end()
             for link in self._links_of(node):
                 other = link.far_end(node)
-                self.pass_on(Kind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
+                self.pass_on(MessageKind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
 
     def kill(self, node: Node) -> None:
         """End a node like a killed process: its messages that have not arrived are lost. Idempotent."""
@@ -153,7 +153,7 @@ class Network:
         """A number that is unique in this network."""
         return next(self._numbers)
 
-    def spread(self, source: Node, message: Message, kind: Kind) -> None:
+    def spread(self, source: Node, message: Message, kind: MessageKind) -> None:
         """Send to all nodes that would read the message; readers of the source itself get it at once."""
         with self.lock:
             _check_open(source)
@@ -181,7 +181,7 @@ class Network:
             source.tokens[token] = key
             source.see(source, token, key)
             for target in self._others(source):
-                self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+                self.pass_on(MessageKind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
 
     def hide(self, source: Node, token: int) -> None:
         """Withdraw a sign of life. Idempotent."""
@@ -191,7 +191,7 @@ class Network:
                 return
             source.lose_sight(token)
             for target in self._others(source):
-                self.pass_on(Kind.FALL, source, target, Message(key, None), _losing(target, token))
+                self.pass_on(MessageKind.FALL, source, target, Message(key, None), _losing(target, token))
 
     def ask(self, source: Node, pattern: str, timeout_s: float) -> list[Answer]:
         """Query all others; wait, by the real clock, until all that are not lost have replied."""
@@ -220,7 +220,7 @@ class Network:
         return [other for other in others if not other.closed]
 
     def pass_on(
-        self, kind: Kind, source: Node, target: Node, message: Message, arrive: Arrive, *, at_once: bool = False
+        self, kind: MessageKind, source: Node, target: Node, message: Message, arrive: Arrive, *, at_once: bool = False
     ) -> None:
         """Send one message over one link; a tap may have removed the link meanwhile."""
         self.sent[kind] += 1
@@ -290,7 +290,7 @@ class Network:
                     way.cut, way.cuts = True, way.cuts + 1
                     self._expire_later(link, way)
 
-    def _expire_later(self, link: Link, way: Way) -> None:
+    def _expire_later(self, link: Link, way: LinkDirection) -> None:
         cut = way.cuts
 
         def expire() -> None:
@@ -327,7 +327,7 @@ class Network:
         for source in link.ends:
             target = link.far_end(source)
             for token, key in list(source.tokens.items()):
-                self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+                self.pass_on(MessageKind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
 
 
 class _Query(Question):
@@ -346,7 +346,7 @@ class _Query(Question):
         """Send the query. Used under the network's lock."""
         message = Message(self._pattern, None)
         self._network.pass_on(
-            Kind.ASK, self._source, self._target, message, lambda: self._queryable.take(self), at_once=True
+            MessageKind.ASK, self._source, self._target, message, lambda: self._queryable.take(self), at_once=True
         )
 
     @property
@@ -361,7 +361,7 @@ class _Query(Question):
             if meet(self._pattern, key):
                 message = Message(key, payload)
                 self._network.pass_on(
-                    Kind.ANSWER,
+                    MessageKind.ANSWER,
                     self._target,
                     self._source,
                     message,

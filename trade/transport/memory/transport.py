@@ -5,7 +5,7 @@ from typing import Any
 
 from trade.transport.base import Answer, Channel, ChannelClosed, Message, Presence, Publisher, Questions, Transport
 from trade.transport.memory.keys import meet
-from trade.transport.memory.links import Kind
+from trade.transport.memory.links import MessageKind
 from trade.transport.memory.network import Network
 from trade.transport.memory.node import Inbox, MemoryChannel, MemoryQuestions
 
@@ -13,7 +13,7 @@ from trade.transport.memory.node import Inbox, MemoryChannel, MemoryQuestions
 class MemoryPublisher(Publisher):
     """Publishes under one key of a network in memory."""
 
-    def __init__(self, transport: "MemoryTransport", key: str, kind: Kind) -> None:
+    def __init__(self, transport: "MemoryTransport", key: str, kind: MessageKind) -> None:
         self._transport = transport
         self._key = key
         self._kind = kind
@@ -61,13 +61,15 @@ class MemoryTransport(Transport):
 
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         self._check_open()
-        return MemoryPublisher(self, key, Kind.DROPPABLE if droppable else Kind.URGENT if urgent else Kind.PUT)
+        return MemoryPublisher(
+            self, key, MessageKind.DROPPABLE if droppable else MessageKind.URGENT if urgent else MessageKind.PUT
+        )
 
     def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
         return self._listen(pattern, self.node.ears, newest=newest)
 
     def announce(self, key: str, payload: bytes) -> None:
-        self.network.spread(self.node, Message(key, payload), Kind.ANNOUNCE)
+        self.network.spread(self.node, Message(key, payload), MessageKind.ANNOUNCE)
 
     def announcements(self, pattern: str) -> Channel:
         return self._listen(pattern, self.node.ears, of_others=True)

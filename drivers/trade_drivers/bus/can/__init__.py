@@ -5,16 +5,16 @@ from trade_drivers.bus.can._errors import ErrorState, error_state
 from trade_drivers.bus.can._listeners import Listeners
 from trade_drivers.bus.can._netlink import Link, look_at
 from trade_drivers.bus.can._port import CanPort, Frame, split_port
-from trade_drivers.bus.can._sniffer import Talk
+from trade_drivers.bus.can._sniffer import FramesById
 
 __all__ = [
     "CanPort",
     "ErrorState",
     "Frame",
+    "FramesById",
     "Link",
     "Listeners",
     "LoadMeter",
-    "Talk",
     "error_state",
     "frame_bits",
     "look_at",

@@ -18,7 +18,7 @@ from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
 from trade_drivers.bus.can._errors import ErrorState, error_state, unheard
 from trade_drivers.bus.can._netlink import look_at
 from trade_drivers.bus.can._send_queue import LONGEST_S, SendQueue, is_full
-from trade_drivers.bus.can._sniffer import Talk
+from trade_drivers.bus.can._sniffer import FramesById
 from trade_drivers.bus.can._socketcand import ServerBus
 from trade_robotfile import CanBus
 
@@ -55,7 +55,7 @@ def split_port(port: str, where: str) -> tuple[str, str]:
     return interface, channel
 
 
-def _no_orders(_: Talk) -> Collection[int]:
+def _no_orders(_: FramesById) -> Collection[int]:
     """Accepts any traffic."""
     return ()
 
@@ -78,7 +78,7 @@ class CanPort:
         bitrate: int,
         where: str = "bus",
         listen_s: float = 0.0,
-        orders: Callable[[Talk], Collection[int]] = _no_orders,
+        orders: Callable[[FramesById], Collection[int]] = _no_orders,
         patience_s: float = LONGEST_S,
     ) -> None:
         self.path = path
@@ -87,7 +87,7 @@ class CanPort:
         """Total number of error frames received."""
         self.bus_offs = 0
         """Number of bus-offs."""
-        self.talk = Talk({})
+        self.sniffed = FramesById({})
         """The traffic heard at the last opening."""
         self._where = where
         self._listen_s, self._orders = listen_s, orders
@@ -103,7 +103,7 @@ class CanPort:
         self._was_full = False
 
     @classmethod
-    def of(cls, path: str, bus: CanBus, where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
+    def of(cls, path: str, bus: CanBus, where: str, orders: Callable[[FramesById], Collection[int]]) -> "CanPort":
         """Returns a port for a driver: it listens for as long as watchdogs take.
 
         A device that has torque after that is fed by another driver, or has no watchdog.
@@ -162,8 +162,8 @@ class CanPort:
             frame = self.receive(min(left_s, _SLICE_S))
             if frame is not None:
                 heard.setdefault(frame.id, []).append(frame.data)
-        self.talk = Talk(heard)
-        if orders := self._orders(self.talk):
+        self.sniffed = FramesById(heard)
+        if orders := self._orders(self.sniffed):
             ids = ", ".join(f"{one:03X}h" for one in sorted(orders))
             problem = f"{self.path}: another driver commands the devices of this bus (it sends {ids}); stop it first"
             raise self._wrong("channel", problem)

@@ -17,7 +17,7 @@ _STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
 _NODE: Final = 0x7F
 
 
-class Talk:
+class FramesById:
     """Received frames by identifier."""
 
     def __init__(self, frames: Mapping[int, Sequence[bytes]]) -> None:

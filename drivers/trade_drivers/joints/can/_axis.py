@@ -4,7 +4,7 @@ from abc import abstractmethod
 from math import isfinite, tau
 from typing import Final
 
-from trade_drivers.joints import Axis, Resolution, Sample, Unfit
+from trade_drivers.joints import Axis, DeviceUnusable, Resolution, Sample
 from trade_robotfile import Joint
 
 STILL_RAD_S: Final = 0.01
@@ -30,7 +30,7 @@ def resolution_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Resolu
     )
 
 
-class Another(Unfit):
+class DifferentMotor(DeviceUnusable):
     """The motor is another one than in the robot file."""
 
     def __init__(self, key: str, expected: str, found: str, kind: str = "motor") -> None:
@@ -39,23 +39,23 @@ class Another(Unfit):
 
 
 def check_keys(axis: "MotorAxis", kind: str, unit: str) -> None:
-    """Raises ``Unfit`` for keys that such motors do not have, and for a zero that is not known."""
+    """Raises ``DeviceUnusable`` for keys that such motors do not have, and for a zero that is not known."""
     joint = axis.joint
     if joint.counts_per_rev is not None:
-        raise Unfit(f"{kind} reports {unit}, not counts; leave this key out", ".counts_per_rev")
+        raise DeviceUnusable(f"{kind} reports {unit}, not counts; leave this key out", ".counts_per_rev")
     if joint.homing_counts:
-        raise Unfit("is for servos; leave this key out", ".homing_counts")
+        raise DeviceUnusable("is for servos; leave this key out", ".homing_counts")
     if joint.serial_number is not None:
-        raise Unfit(f"{kind} reports no serial number here; leave this key out", ".serial_number")
+        raise DeviceUnusable(f"{kind} reports no serial number here; leave this key out", ".serial_number")
     _check_zero_known(axis)
 
 
 def _check_zero_known(axis: "MotorAxis") -> None:
-    """Raises ``Unfit`` for a range wider than a turn of the motor, if the file does not say how the zero is known."""
+    """Raises ``DeviceUnusable`` for a range over a turn of the motor if the file does not say how zero is known."""
     joint, turn_rad = axis.joint, tau / axis.joint.gear
     wide_rad = joint.max_rad - joint.min_rad
     if joint.zero is None and wide_rad > turn_rad:
-        raise Unfit(
+        raise DeviceUnusable(
             f"missing: the range is {wide_rad:.4g} rad, but without power {joint.model} keeps its place within "
             f'{turn_rad:.4g} rad at most, a turn of the motor; write zero = "last" if the joint stays where it is '
             'without power, or zero = "kept" if the device keeps or finds its zero',

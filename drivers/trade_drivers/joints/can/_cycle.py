@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
-from trade_drivers.joints import Exchange, Steps, Unfit, next_measurement
+from trade_drivers.joints import DeviceUnusable, Exchange, Steps, next_measurement
 from trade_drivers.joints.can._axis import MotorAxis
 from trade_robotfile import CanBus, Joint
 
@@ -176,9 +176,9 @@ class MotorExchange(Exchange[_Axis]):
             _log.info("%s answers on %s", axis.name, axis.bus)
             axis.welcome(self.clock())
             self.problems.pop(axis, None)
-        except (Unfit, NoAnswer) as problem:
+        except (DeviceUnusable, NoAnswer) as problem:
             self.problems[axis] = problem
-            if isinstance(problem, Unfit):
+            if isinstance(problem, DeviceUnusable):
                 axis.fault, axis.ready = str(problem), False  # replaces an earlier fault, as this must be fixed first
             axis.probe_at_ns = self.clock() + _AGAIN_NS
         else:

@@ -12,13 +12,13 @@ from trade_drivers._validation import not_installed
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
-from trade_drivers.joints import AttachedJoints, BusMotor, BusThread, PortLost, Unfit, start_thread
-from trade_drivers.joints.can._axis import Another, MotorAxis
+from trade_drivers.joints import AttachedJoints, BusMotor, BusThread, DeviceUnusable, PortLost, start_thread
+from trade_drivers.joints.can._axis import DifferentMotor, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort, Talk
+    from trade_drivers.bus.can import CanPort, FramesById
     from trade_drivers.commissioning._can_scan import CanBench
     from trade_drivers.joints.can._cycle import MotorExchange
 
@@ -67,7 +67,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
 
     @staticmethod
     @abstractmethod
-    def orders(talk: "Talk", nodes: Collection[int]) -> Collection[int]:
+    def orders(sniffed: "FramesById", nodes: Collection[int]) -> Collection[int]:
         """Returns the identifiers among the traffic that only another driver sends, to these nodes or any."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
@@ -160,10 +160,10 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
         """Raises ``ConfigurationError`` for a motor that cannot be accepted; ``last``: ``DeviceAbsent`` if silent."""
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
-            case Another() as other:
+            case DifferentMotor() as other:
                 name = other.key.removeprefix(".")
                 raise WrongDevice(where=key, key=name, expected=other.expected, found=other.found)
-            case Unfit() as unfit:
+            case DeviceUnusable() as unfit:
                 raise ConfigurationError(where=f"{key}{unfit.key}", problem=str(unfit))
             case NoAnswer() if last:
                 problem = (

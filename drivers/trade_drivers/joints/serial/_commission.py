@@ -4,8 +4,8 @@ from abc import abstractmethod
 from contextlib import suppress
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
-from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
-from trade_drivers.commissioning._commissioner import Bench, Found
+from trade_drivers.bus._jobs import BadAnswer, NoAnswer, RequestRefused
+from trade_drivers.commissioning._commissioner import Bench, ScannedDevice
 from trade_drivers.joints import Resolution
 from trade_drivers.joints.serial._axis import Register
 
@@ -50,7 +50,7 @@ class ServoBench(Bench, Generic[_Wire]):
     def anybody(self) -> bool:
         return True
 
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         found = self._look(device_id)
         if found is not None and found.problem == _SHARED:
             late = all(self._look(device_id) is None for _ in range(_LOOKS - 1))  # it was an answer of another id
@@ -60,7 +60,7 @@ class ServoBench(Bench, Generic[_Wire]):
                 found = self._look(device_id)
         return found
 
-    def _look(self, device_id: int) -> Found | None:
+    def _look(self, device_id: int) -> ScannedDevice | None:
         try:
             number = self.wire.ping(device_id)
         except BadAnswer:
@@ -83,7 +83,7 @@ class ServoBench(Bench, Generic[_Wire]):
         except NoAnswer:
             self.wire.settled_at = 0.0
             return self._found(device_id, model, problem=self.mute)
-        except Refused as refused:
+        except RequestRefused as refused:
             return self._found(device_id, model, problem=f"it refuses to be read: {refused}")
         return self._found(device_id, model, firmware, torque, _SHARED if shared else "", homing)
 
@@ -95,8 +95,8 @@ class ServoBench(Bench, Generic[_Wire]):
         torque: bool | None = None,
         problem: str = "",
         homing_counts: int = 0,
-    ) -> Found:
-        return Found(
+    ) -> ScannedDevice:
+        return ScannedDevice(
             driver=self.driver,
             baud=self._baud,
             id=device_id,

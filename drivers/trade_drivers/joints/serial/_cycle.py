@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 from trade.errors import ConfigurationError, DeadlineExceeded, DeviceSilent, OutcomeUnknown
 from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._cycle import PROBE_NS
-from trade_drivers.bus._jobs import NoAnswer, Refused
-from trade_drivers.joints import Exchange, Motion, Steps, Work
+from trade_drivers.bus._jobs import NoAnswer, RequestRefused
+from trade_drivers.joints import AwaitedJob, Exchange, Motion, Steps
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_robotfile import SerialBus
 
@@ -114,7 +114,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
 
         return (yield from self.retry(axis, read))
 
-    def write_register(self, job: Work[_Servo], axis: _Servo, register: Register, value: int) -> Steps:
+    def write_register(self, job: AwaitedJob[_Servo], axis: _Servo, register: Register, value: int) -> Steps:
         """Writes a register and waits for the confirmation."""
         data = register.encode(value)
         yield from self.retry(axis, lambda: self.wire.write(axis.id, register.address, data, job.gate))
@@ -147,7 +147,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             except NoAnswer:
                 asked = axis.doubted = True
                 yield
-            except Refused as refused:
+            except RequestRefused as refused:
                 raise axis.fault_error(f"it refused a command: {refused}") from None
             else:
                 yield
@@ -247,7 +247,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             except NoAnswer:
                 self.missed(axis)
                 return
-            except Refused as refused:
+            except RequestRefused as refused:
                 axis.fault, axis.doubted = f"it refuses to be read: {refused}", False
             if axis.silent:
                 axis.probe_at_ns = self.clock() + PROBE_NS
@@ -264,7 +264,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         except NoAnswer:
             self.missed(axis)
             return False
-        except Refused as refused:
+        except RequestRefused as refused:
             axis.fault = f"it refuses to be read: {refused}"
         return True
 

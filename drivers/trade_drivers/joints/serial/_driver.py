@@ -11,7 +11,7 @@ from trade_drivers.joints import AttachedJoints, start_thread
 from trade_drivers.joints.serial._axis import ServoAxis
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
-from trade_drivers.joints.serial._inspect import Kept, first_look
+from trade_drivers.joints.serial._inspect import PersistentRegisters, first_look
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_robotfile import Bus, Gripper, Joint, Robot, SerialBus
 
@@ -31,7 +31,7 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
     """Supported models by the name printed on them."""
     bauds: ClassVar[Collection[int]]
     """Supported baud rates."""
-    kept: ClassVar[Kept]
+    kept: ClassVar[PersistentRegisters]
     """The layout of their persistent registers."""
 
     @abstractmethod

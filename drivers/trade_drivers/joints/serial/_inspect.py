@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers.bus._attempts import ATTEMPTS, attempts
-from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
-from trade_drivers.joints import Unfit, check_least, check_rate
+from trade_drivers.bus._jobs import BadAnswer, NoAnswer, RequestRefused
+from trade_drivers.joints import DeviceUnusable, check_least, check_rate
 from trade_drivers.joints.serial._axis import ServoAxis
 from trade_robotfile import SerialBus
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _Result = TypeVar("_Result")
 
 
-class Kept(NamedTuple):
+class PersistentRegisters(NamedTuple):
     """The layout of the persistent registers of one vendor's servos."""
 
     registers: tuple[int, int]
@@ -28,7 +28,7 @@ class Kept(NamedTuple):
 
 
 def check_ranges(axis: ServoAxis[Any]) -> None:
-    """Raises ``Unfit`` for a range that exceeds the device's, or a limit that cannot be set."""
+    """Raises ``DeviceUnusable`` for a range that exceeds the device's, or a limit that cannot be set."""
     _check_turn(axis)
     check_least(axis, f"the least setting of an {axis.joint.model}")
 
@@ -42,7 +42,7 @@ def _check_turn(axis: ServoAxis[Any]) -> None:
     key, value = (".min_rad", joint.min_rad) if joint.min_rad < low else (".max_rad", joint.max_rad)
     degrees = "; degrees? radians are meant" if max(abs(joint.min_rad), abs(joint.max_rad)) > tau else ""
     problem = f"{value:.6g} is outside the range of an {joint.model}: {low:.6g} to {high:.6g} rad{degrees}"
-    raise Unfit(problem, key)
+    raise DeviceUnusable(problem, key)
 
 
 def check_cycle(bus: SerialBus, count: int, cycle_bytes: int, where: str) -> None:
@@ -117,7 +117,7 @@ def again(
             if attempt:
                 wire.ping(axis.id)
             return act()
-        except Refused as refused:
+        except RequestRefused as refused:
             raise ConfigurationError(where=axis.name, problem=f"it refuses to be read: {refused}") from None
         except NoAnswer as missed:
             silent = missed
@@ -146,7 +146,12 @@ def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
 
 
 def first_look(
-    wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], kept: Kept, clock_ns: Callable[[], int], key: str
+    wire: "ServoWire",
+    bus: SerialBus,
+    axis: ServoAxis[Any],
+    kept: PersistentRegisters,
+    clock_ns: Callable[[], int],
+    key: str,
 ) -> bytes:
     """Checks that a joint's device is that of the robot file, and takes its first measurements.
 

@@ -17,7 +17,7 @@ _WHOLE_SECOND_ANSWER_S: Final = 0.005
 class ServoWire(SerialWire):
     """One serial port and the packets on it. All exchanges but sync writes may wait until the line is settled.
 
-    They raise ``NoAnswer`` if no complete answer arrives in time, ``Refused`` if the device refuses, and ``PortLost``.
+    They raise ``NoAnswer`` if no complete answer arrives in time, ``RequestRefused`` for a refusal, and ``PortLost``.
     """
 
     @abstractmethod

@@ -193,9 +193,9 @@ class DriveAxis(MotorAxis):
             why = f"network management has made it {table.NMT_STATES.get(state, hex(state))}"
             self._lose(_STOPPED if self.stopped else why, now_ns)
 
-    def _lose(self, why: str, now_ns: int) -> None:
+    def _lose(self, reason: str, now_ns: int) -> None:
         if self.ready:
-            self.latch(why)
+            self.latch(reason)
         self.forget(now_ns)
 
     def forget(self, now_ns: int) -> None:

@@ -74,11 +74,11 @@ class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
 
     def check_away(self, exchange: "DriveExchange", axis: "DriveAxis", where: str, *, last: bool) -> None:
         from trade_drivers.vendors.cia402._axis import Stage  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._wire import NoAnswer, Refused  # noqa: PLC0415 - the libraries are optional
+        from trade_drivers.vendors.cia402._wire import DriveRefused, NoAnswer  # noqa: PLC0415 - the libraries are optional
 
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
-            case Refused() as refused:
+            case DriveRefused() as refused:
                 raise ConfigurationError(where=key, problem=f"it refuses to be read: {refused}")
             case NoAnswer() as silent if last and axis.stage is Stage.AWAY:
                 problem = (

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import DeviceSilent
 from trade_drivers.bus._cycle import HALT_NS, PROBE_NS
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import ControlMode, Gate, Goal, Motion, Steps, Work, next_measurement, until
+from trade_drivers.joints import AwaitedJob, ControlMode, Gate, Goal, Motion, Steps, next_measurement, until
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis, Following, Stage, Turning
-from trade_drivers.vendors.cia402._table import Entry, State
+from trade_drivers.vendors.cia402._table import DictionaryEntry, State
 from trade_drivers.vendors.cia402._verify import Admission, check_bus, heartbeat_ms
-from trade_drivers.vendors.cia402._wire import Net, NoAnswer, Refused
+from trade_drivers.vendors.cia402._wire import DriveRefused, Net, NoAnswer
 from trade_robotfile import CanBus
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         """Restarts a drive that network management has stopped."""
         self.admissions[self.devices.index(axis)].recall()
 
-    def mode_for(self, job: Work[DriveAxis], axis: DriveAxis) -> int:
+    def mode_for(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> int:
         """Returns the mode of operation for a job's commands to this drive."""
         match job.control_mode if isinstance(job, Motion) else ControlMode.GOALS:
             case ControlMode.POSITIONS if _all_follow(job.devices):
@@ -177,7 +177,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
             elif axis.stream is None:
                 yield from until(self, axis, lambda: axis.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
 
-    def enabling(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def enabling(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Switches torque on at the measured position, halted or with that as its target; confirms each step.
 
         A drive that is already enabled must be at rest: then only its mode changes. A homing ends.
@@ -206,7 +206,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         axis.fault, axis.ready, axis.entered, axis.raised_ns = "", True, mode, 0
         axis.stream = self.stream_for(axis, mode, axis.target)
 
-    def _take_back(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def _take_back(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Restarts a drive stopped by network management, and sets it up like one that was offline."""
         give_up_ns = self.clock() + _TAKEN_BACK_NS
         axis.recalled = True
@@ -222,7 +222,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
             axis.recalled = False
         job.note("taken back from network management's stop: pre-operational, and set up")
 
-    def _begin_at_rest(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def _begin_at_rest(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Clears old targets, which could move it in another mode."""
         if axis.may_hold_torque:
             yield from until(
@@ -236,13 +236,13 @@ class DriveExchange(MotorExchange[DriveAxis]):
             self.command(axis, table.HOLD, target)
         axis.entered, axis.stream = 0, None
 
-    def resting(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def resting(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Ends its motion on the drive's own ramp."""
         job.gate()
         self.halt([axis], "another kind of motion took over")
         yield from until(self, axis, lambda: axis.still >= _AT_REST, "a halt was sent, but it is still moving", HALT_NS)
 
-    def _climb(self, job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
+    def _climb(self, job: AwaitedJob[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
         """Steps through the states to enabled, with the measured position as goal.
 
         The drive is then halted, except in a mode without a goal, where not all drives support halt.
@@ -262,7 +262,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
                 return
             yield from until(self, axis, lambda: axis.state_now is not before, _stays(axis))  # noqa: B023 - over before the next round
 
-    def _reset(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def _reset(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Clears the drive's own fault, without enabling it."""
         for word in (table.DISABLE_VOLTAGE, table.RESET_FAULT):
             job.gate()
@@ -271,12 +271,12 @@ class DriveExchange(MotorExchange[DriveAxis]):
         stays = f"its fault cannot be cleared: {axis.fault or 'it stays'}"
         yield from until(self, axis, lambda: axis.state_now is not State.FAULT, stays)
 
-    def set_mode(self, job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
+    def set_mode(self, job: AwaitedJob[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
         """Changes the mode of operation, and waits until the drive reports it."""
         yield from self.write(job, axis, table.MODE, mode)
         yield from until(self, axis, lambda: axis.mode == mode, f"it does not enter mode {mode} (6061h)")
 
-    def relaxing(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+    def relaxing(self, job: AwaitedJob[DriveAxis], axis: DriveAxis) -> Steps:
         """Switches torque off; the watchdog stays armed."""
         axis.ready = False
         if axis.may_hold_torque:
@@ -284,7 +284,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
             self.command(axis, table.DISABLE_VOLTAGE)
         yield from until(self, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
 
-    def leaving(self, job: Work[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
+    def leaving(self, job: AwaitedJob[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
         """Switches torque off, or leaves it on for a joint seen at rest, and only then disarms the watchdog."""
         if relax:
             yield from self.relaxing(job, axis)
@@ -293,7 +293,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         yield from self.write(job, axis, table.CONSUMER_HEARTBEAT, 0)
         axis.ready = False
 
-    def write(self, job: Work[DriveAxis], axis: DriveAxis, entry: Entry, value: int) -> Steps:
+    def write(self, job: AwaitedJob[DriveAxis], axis: DriveAxis, entry: DictionaryEntry, value: int) -> Steps:
         """Writes to its dictionary, with confirmation.
 
         Raises:
@@ -309,14 +309,14 @@ class DriveExchange(MotorExchange[DriveAxis]):
                 self.require_answering(axis)
         except NoAnswer:
             raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(self.clock() - began_ns) / 1e9) from None
-        except Refused as refused:
+        except DriveRefused as refused:
             raise axis.fault_error(f"it refused a command: {refused}") from None
 
     # --- from the bus thread
 
     def on_open(self) -> None:
         for axis in self.devices:
-            for data in self.port.talk.frames.get(table.HEARTBEAT + axis.id, ()):
+            for data in self.port.sniffed.frames.get(table.HEARTBEAT + axis.id, ()):
                 axis.take_heartbeat(data, self.clock())
 
     def cycle(self) -> None:

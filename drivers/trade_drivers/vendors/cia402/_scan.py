@@ -6,12 +6,12 @@ from typing import Final
 
 from trade_drivers.bus.can import CanPort, Listeners
 from trade_drivers.commissioning._can_scan import CanBench
-from trade_drivers.commissioning._commissioner import Found
-from trade_drivers.joints import Unfit
+from trade_drivers.commissioning._commissioner import ScannedDevice
+from trade_drivers.joints import DeviceUnusable
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._table import state_of
 from trade_drivers.vendors.cia402._units import read_scale
-from trade_drivers.vendors.cia402._wire import Answer, Net, NoAnswer, Refused
+from trade_drivers.vendors.cia402._wire import Answer, DriveRefused, Net, NoAnswer
 
 _AT_ONCE: Final = 8
 """Number of simultaneous requests, as the queues of interfaces are short."""
@@ -32,7 +32,7 @@ class DriveBench(CanBench):
         super().__init__(port, bitrate)
         self._listeners = Listeners(port, _nothing, _nothing)
         self._net = Net(self._listeners)
-        self._known: dict[int, Found | None] = {}
+        self._known: dict[int, ScannedDevice | None] = {}
 
     def anybody(self) -> bool:
         """Scans nodes in batches, so that absent ones cost little time."""
@@ -41,7 +41,7 @@ class DriveBench(CanBench):
             self._ask(some)
         return any(self._known.values())
 
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         if device_id not in self._known:
             self._ask([device_id])
         return self._known.pop(device_id)
@@ -57,13 +57,13 @@ class DriveBench(CanBench):
                     del asking[node]
             self._listeners.take_in(_SLICE_S)
 
-    def _identify(self, node: int) -> Answer[Found | None]:
+    def _identify(self, node: int) -> Answer[ScannedDevice | None]:
         try:
             kind = (yield from self._net.read(node, table.DEVICE_TYPE)) & 0xFFFF
         except NoAnswer:
-            beats = self._talk.frames.get(table.HEARTBEAT + node, ())
+            beats = self._sniffed.frames.get(table.HEARTBEAT + node, ())
             return self.found(node, problem=_STOPPED) if bytes((table.STOPPED,)) in beats[-1:] else None
-        except Refused as refused:
+        except DriveRefused as refused:
             return self.found(node, problem=f"it refuses to be read: {refused}")
         if kind != table.DRIVE_PROFILE:
             return self.found(node, problem=f"is no CiA 402 drive: its device type (1000h) names profile {kind}")
@@ -73,9 +73,9 @@ class DriveBench(CanBench):
             model = yield from self._text(node, table.DEVICE_NAME)
             firmware = yield from self._text(node, table.SOFTWARE_VERSION)
             scale = yield from read_scale(self._net, node)
-        except (NoAnswer, Refused) as bad:
+        except (NoAnswer, DriveRefused) as bad:
             return self.found(node, problem=f"it does not tell who it is: {bad}")
-        except Unfit as unfit:
+        except DeviceUnusable as unfit:
             return self.found(node, problem=str(unfit))
         state = state_of(statusword)
         return self.found(
@@ -91,7 +91,7 @@ class DriveBench(CanBench):
         """Reads an optional text."""
         try:
             return (yield from self._net.read_text(node, index))
-        except Refused:
+        except DriveRefused:
             return ""
 
 

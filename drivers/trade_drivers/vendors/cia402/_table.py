@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final, Literal
 from msgspec import Struct
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import Talk
+    from trade_drivers.bus.can import FramesById
 
 Kind = Literal["u1", "u2", "u4", "i1", "i2", "i4"]
 
 
-class Entry(Struct, frozen=True):
+class DictionaryEntry(Struct, frozen=True):
     """One object, or one field of it."""
 
     index: int
@@ -40,51 +40,51 @@ class Entry(Struct, frozen=True):
         return f"{self.index:04X}h" + (f":{self.sub}" if self.sub else "")
 
 
-DEVICE_TYPE: Final = Entry(0x1000, "u4")
+DEVICE_TYPE: Final = DictionaryEntry(0x1000, "u4")
 DEVICE_NAME: Final = 0x1008
 SOFTWARE_VERSION: Final = 0x100A
-CONSUMER_HEARTBEAT: Final = Entry(0x1016, "u4", 1)
+CONSUMER_HEARTBEAT: Final = DictionaryEntry(0x1016, "u4", 1)
 """The monitored heartbeat: ``node << 16`` plus the timeout in milliseconds."""
-PRODUCER_HEARTBEAT: Final = Entry(0x1017, "u2")
+PRODUCER_HEARTBEAT: Final = DictionaryEntry(0x1017, "u2")
 """In milliseconds."""
-IDENTITY: Final = tuple(Entry(0x1018, "u4", sub) for sub in (1, 2, 3, 4))
+IDENTITY: Final = tuple(DictionaryEntry(0x1018, "u4", sub) for sub in (1, 2, 3, 4))
 """Vendor, product, revision, serial number."""
 
-ABORT_CONNECTION: Final = Entry(0x6007, "i2")
-ERROR_CODE: Final = Entry(0x603F, "u2")
-CONTROLWORD: Final = Entry(0x6040, "u2")
-STATUSWORD: Final = Entry(0x6041, "u2")
-QUICK_STOP_OPTION: Final = Entry(0x605A, "i2")
-HALT_OPTION: Final = Entry(0x605D, "i2")
-MODE: Final = Entry(0x6060, "i1")
-MODE_DISPLAY: Final = Entry(0x6061, "i1")
-POSITION: Final = Entry(0x6064, "i4")
-VELOCITY: Final = Entry(0x606C, "i4")
-TORQUE: Final = Entry(0x6077, "i2")
-TARGET_POSITION: Final = Entry(0x607A, "i4")
-ENCODER: Final = (Entry(0x608F, "u4", 1), Entry(0x608F, "u4", 2))
+ABORT_CONNECTION: Final = DictionaryEntry(0x6007, "i2")
+ERROR_CODE: Final = DictionaryEntry(0x603F, "u2")
+CONTROLWORD: Final = DictionaryEntry(0x6040, "u2")
+STATUSWORD: Final = DictionaryEntry(0x6041, "u2")
+QUICK_STOP_OPTION: Final = DictionaryEntry(0x605A, "i2")
+HALT_OPTION: Final = DictionaryEntry(0x605D, "i2")
+MODE: Final = DictionaryEntry(0x6060, "i1")
+MODE_DISPLAY: Final = DictionaryEntry(0x6061, "i1")
+POSITION: Final = DictionaryEntry(0x6064, "i4")
+VELOCITY: Final = DictionaryEntry(0x606C, "i4")
+TORQUE: Final = DictionaryEntry(0x6077, "i2")
+TARGET_POSITION: Final = DictionaryEntry(0x607A, "i4")
+ENCODER: Final = (DictionaryEntry(0x608F, "u4", 1), DictionaryEntry(0x608F, "u4", 2))
 """Increments of the encoder, for so many turns of the motor."""
-GEAR_RATIO: Final = (Entry(0x6091, "u4", 1), Entry(0x6091, "u4", 2))
+GEAR_RATIO: Final = (DictionaryEntry(0x6091, "u4", 1), DictionaryEntry(0x6091, "u4", 2))
 """Turns of the motor, for so many of the shaft."""
-FEED: Final = (Entry(0x6092, "u4", 1), Entry(0x6092, "u4", 2))
+FEED: Final = (DictionaryEntry(0x6092, "u4", 1), DictionaryEntry(0x6092, "u4", 2))
 """Counts of a position, for so many turns of the shaft."""
-POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = (Entry(index, "u4") for index in (0x60A8, 0x60A9, 0x60AA))
-POSITION_LIMITS: Final = (Entry(0x607D, "i4", 1), Entry(0x607D, "i4", 2))
-POLARITY: Final = Entry(0x607E, "u1")
+POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = (DictionaryEntry(index, "u4") for index in (0x60A8, 0x60A9, 0x60AA))
+POSITION_LIMITS: Final = (DictionaryEntry(0x607D, "i4", 1), DictionaryEntry(0x607D, "i4", 2))
+POLARITY: Final = DictionaryEntry(0x607E, "u1")
 """Bits that reverse positions and speeds."""
 REVERSED: Final = 0xC0
-MAX_PROFILE_VELOCITY: Final = Entry(0x607F, "u4")
-PROFILE_VELOCITY: Final = Entry(0x6081, "u4")
-ACCELERATION: Final = Entry(0x6083, "u4")
-DECELERATION: Final = Entry(0x6084, "u4")
-QUICK_STOP_DECELERATION: Final = Entry(0x6085, "u4")
-HOMING_METHOD: Final = Entry(0x6098, "i1")
-HOMING_SPEEDS: Final = (Entry(0x6099, "u4", 1), Entry(0x6099, "u4", 2))
-HOMING_ACCELERATION: Final = Entry(0x609A, "u4")
-INTERPOLATION_PERIOD: Final = (Entry(0x60C2, "u1", 1), Entry(0x60C2, "i1", 2))
+MAX_PROFILE_VELOCITY: Final = DictionaryEntry(0x607F, "u4")
+PROFILE_VELOCITY: Final = DictionaryEntry(0x6081, "u4")
+ACCELERATION: Final = DictionaryEntry(0x6083, "u4")
+DECELERATION: Final = DictionaryEntry(0x6084, "u4")
+QUICK_STOP_DECELERATION: Final = DictionaryEntry(0x6085, "u4")
+HOMING_METHOD: Final = DictionaryEntry(0x6098, "i1")
+HOMING_SPEEDS: Final = (DictionaryEntry(0x6099, "u4", 1), DictionaryEntry(0x6099, "u4", 2))
+HOMING_ACCELERATION: Final = DictionaryEntry(0x609A, "u4")
+INTERPOLATION_PERIOD: Final = (DictionaryEntry(0x60C2, "u1", 1), DictionaryEntry(0x60C2, "i1", 2))
 """The interpolation period of a cyclic position: a number and a power of ten in s."""
-TARGET_VELOCITY: Final = Entry(0x60FF, "i4")
-SUPPORTED_MODES: Final = Entry(0x6502, "u4")
+TARGET_VELOCITY: Final = DictionaryEntry(0x60FF, "i4")
+SUPPORTED_MODES: Final = DictionaryEntry(0x6502, "u4")
 """Bit ``mode - 1`` for each."""
 
 PROFILE_POSITION: Final = 1
@@ -113,11 +113,13 @@ NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
 NOT_IN_THIS_STATE: Final = 0x08000022
 
 
-def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
+def orders(sniffed: "FramesById", nodes: Iterable[int] = ()) -> set[int]:
     """Returns identifiers that only a driver sends, for these nodes or those that send heartbeats."""
     network_wide = {NMT, SYNC, HEARTBEAT + OUR_NODE}
     bases = (SDO_REQUEST, *(pdo.base for pdo in (COMMAND, PROFILE, BRAKING, FOLLOWING)))
-    return talk.frames.keys() & (network_wide | {base + node for base in bases for node in {*nodes, *talk.canopen}})
+    return sniffed.frames.keys() & (
+        network_wide | {base + node for base in bases for node in {*nodes, *sniffed.canopen}}
+    )
 
 
 class Pdo(Struct, frozen=True):
@@ -127,7 +129,7 @@ class Pdo(Struct, frozen=True):
     """The index of its communication parameters; the index of its mapping is 200h higher."""
     base: int
     """The identifier without the node number."""
-    entries: tuple[Entry, ...]
+    entries: tuple[DictionaryEntry, ...]
     layout: struct.Struct
 
     def mapping(self) -> list[int]:

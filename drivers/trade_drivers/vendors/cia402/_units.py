@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
-from trade_drivers.joints import Steps, Unfit, check_least
+from trade_drivers.joints import DeviceUnusable, Steps, check_least
 from trade_drivers.joints.can import STILL_RAD_S
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._table import Entry
-from trade_drivers.vendors.cia402._wire import Answer, Net, Refused
+from trade_drivers.vendors.cia402._table import DictionaryEntry
+from trade_drivers.vendors.cia402._wire import Answer, DriveRefused, Net
 
 _SAME: Final = 1e-6
 _LARGEST: Final = 2**31 - 1
@@ -70,14 +70,14 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
     scale = yield from read_scale(net, axis.id)
     counts = joint.counts_per_rev or 1.0  # checked when the file was
     if scale.counts_per_rev is not None and not isclose(scale.counts_per_rev, counts, rel_tol=_SAME):
-        raise Unfit(
+        raise DeviceUnusable(
             f"the robot file has {counts:.9g} counts for a turn of the motor, the drive {scale.counts_per_rev:.9g} "
             f"({scale.source}); correct the one that is wrong",
             ".counts_per_rev",
         )
     polarity = yield from read_optional(net, axis.id, table.POLARITY)
     if polarity and polarity & table.REVERSED:
-        raise Unfit(
+        raise DeviceUnusable(
             f"its polarity (607Eh) is {polarity:02X}h: it counts in the other direction by itself, and the file has "
             f"reversed = {str(joint.reversed).lower()}; set 607Eh to 0, and measure its direction and zero again",
             ".reversed",
@@ -92,12 +92,14 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
         (table.VELOCITY_UNIT, speed, table.ACCELERATION_UNIT, rad_s2),
     ):
         if unit is None and not isclose(converted, rad):
-            raise Unfit(f"it has a unit of its own in {other}, but no {missing}: that unit is unknown")
+            raise DeviceUnusable(f"it has a unit of its own in {other}, but no {missing}: that unit is unknown")
     still = max(1, round(STILL_RAD_S / rad_s))
     axis.use(replace(axis.resolution, rad_s=rad_s, rad_s2=rad_s2, still_velocity=still))
     check_least(axis, "one of the drive's own unit (60A9h, 60AAh)")
     if max(axis.speed_counts, axis.accel_counts) > _LARGEST:
-        raise Unfit("its speed or acceleration does not fit into 32 bits of the drive's own unit (60A9h, 60AAh)")
+        raise DeviceUnusable(
+            "its speed or acceleration does not fit into 32 bits of the drive's own unit (60A9h, 60AAh)"
+        )
 
 
 def read_scale(net: Net, node: int) -> Answer[Scale]:
@@ -120,11 +122,11 @@ def read_scale(net: Net, node: int) -> Answer[Scale]:
     if feed is not None:
         return Scale(feed[0] / one / gear, _join(feed[1], of_gear), gear, 1 / one)
     if encoder is not None and not isclose(gear, 1.0):
-        raise Unfit(f"its scale is unknown: it has {of_gear} and {encoder[1]}, but no feed (6092h)")
+        raise DeviceUnusable(f"its scale is unknown: it has {of_gear} and {encoder[1]}, but no feed (6092h)")
     return Scale(encoder[0] / one if encoder else None, _join(encoder[1] if encoder else ""), gear, 1 / one)
 
 
-def read_optional(net: Net, node: int, entry: Entry) -> Answer[int | None]:
+def read_optional(net: Net, node: int, entry: DictionaryEntry) -> Answer[int | None]:
     """Reads an object that a drive may lack: then None.
 
     Raises:
@@ -132,25 +134,25 @@ def read_optional(net: Net, node: int, entry: Entry) -> Answer[int | None]:
     """
     try:
         return (yield from net.read(node, entry))
-    except Refused as refused:
+    except DriveRefused as refused:
         if refused.code in table.NO_SUCH_OBJECT:
             return None
-        raise Unfit(f"it refuses to be read: {refused}") from None
+        raise DeviceUnusable(f"it refuses to be read: {refused}") from None
 
 
-def _ratio(net: Net, node: int, entries: tuple[Entry, Entry]) -> Answer[tuple[float, str] | None]:
+def _ratio(net: Net, node: int, entries: tuple[DictionaryEntry, DictionaryEntry]) -> Answer[tuple[float, str] | None]:
     above = yield from read_optional(net, node, entries[0])
     if above is None:
         return None
     below = (yield from read_optional(net, node, entries[1])) or 0
     source = f"{entries[0].index:04X}h = {above}/{below}"
     if not above or not below:
-        raise Unfit(f"its scale is impossible: {source}; set this object of the drive to what is true")
+        raise DeviceUnusable(f"its scale is impossible: {source}; set this object of the drive to what is true")
     return above / below, source
 
 
-def _unit_in_rad(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> float:
-    """Returns a unit of speed or acceleration in rad/s or rad/s^2 of the joint; raises ``Unfit``."""
+def _unit_in_rad(axis: DriveAxis, scale: Scale, entry: DictionaryEntry, unit: int) -> float:
+    """Returns a unit of speed or acceleration in rad/s or rad/s^2 of the joint; raises ``DeviceUnusable``."""
     power, counted, first, second = unit.to_bytes(4, "big")
     is_speed = entry is table.VELOCITY_UNIT
     if (counted, first, second) == (_RPM, _SECOND, 0) and not is_speed:
@@ -165,12 +167,14 @@ def _unit_in_rad(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> floa
     return rad * 10.0 ** _signed(power) / seconds
 
 
-def _unusable(entry: Entry, unit: int, into: str) -> Unfit:
+def _unusable(entry: DictionaryEntry, unit: int, into: str) -> DeviceUnusable:
     power, *codes = unit.to_bytes(4, "big")
     words = [_NAMES.get(code, f"unit {code:02X}h") for code in codes]
     name = "/".join(filter(None, words)) or "no unit"
     factor = f"10^{_signed(power)} " if power else ""
-    return Unfit(f"its unit {factor}{name} ({entry} = {unit:08X}h) cannot be converted to {into}; set another one")
+    return DeviceUnusable(
+        f"its unit {factor}{name} ({entry} = {unit:08X}h) cannot be converted to {into}; set another one"
+    )
 
 
 def _signed(byte: int) -> int:

@@ -7,14 +7,14 @@ from typing import Final
 from trade.errors import ConfigurationError
 from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus.can import frame_bits
-from trade_drivers.joints import Steps, Unfit, check_joints, check_least, check_rate
-from trade_drivers.joints.can import STILL_RAD_S, Another
+from trade_drivers.joints import DeviceUnusable, Steps, check_joints, check_least, check_rate
+from trade_drivers.joints.can import STILL_RAD_S, DifferentMotor
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis, Stage
-from trade_drivers.vendors.cia402._table import Entry, Pdo, State, state_of
+from trade_drivers.vendors.cia402._table import DictionaryEntry, Pdo, State, state_of
 from trade_drivers.vendors.cia402._units import check_units, read_optional
-from trade_drivers.vendors.cia402._wire import Answer, Net, NoAnswer, Refused
+from trade_drivers.vendors.cia402._wire import Answer, DriveRefused, Net, NoAnswer
 from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
@@ -49,13 +49,15 @@ def check_bus(bus: CanBus, axes: Sequence[DriveAxis], where: str) -> None:
 def _check_joint(axis: DriveAxis) -> None:
     joint = axis.joint
     if joint.counts_per_rev is None:
-        raise Unfit("missing; a CiA 402 drive's angles are counts: write counts_per_rev = 4096, or as many", "")
+        raise DeviceUnusable(
+            "missing; a CiA 402 drive's angles are counts: write counts_per_rev = 4096, or as many", ""
+        )
     if joint.homing_counts:
-        raise Unfit("is for servos; leave this key out", ".homing_counts")
+        raise DeviceUnusable("is for servos; leave this key out", ".homing_counts")
     if not 1 <= joint.id < table.OUR_NODE:
-        raise Unfit(f"{joint.id} is no node of a drive; 1 to 126 are (127 is the driver's own)", ".id")
+        raise DeviceUnusable(f"{joint.id} is no node of a drive; 1 to 126 are (127 is the driver's own)", ".id")
     if max(abs(axis.low), abs(axis.high)) > _LARGEST:
-        raise Unfit("the range does not fit into 32 bits of counts; check counts_per_rev and gear", ".max_rad")
+        raise DeviceUnusable("the range does not fit into 32 bits of counts; check counts_per_rev and gear", ".max_rad")
     check_least(axis, "one count of its encoder")
 
 
@@ -84,10 +86,10 @@ def set_up(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
         for pdo in (table.COMMAND, table.PROFILE):
             yield from _map(net, axis.id, pdo, table.AT_EVENT, 0)
         yield from _map_streams(net, axis, bus)
-    except Refused as refused:
-        raise Unfit(f"it refuses to be set up: {refused}") from None
+    except DriveRefused as refused:
+        raise DeviceUnusable(f"it refuses to be set up: {refused}") from None
     for record in table.UNUSED:
-        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+        yield from _try_write(net, axis.id, DictionaryEntry(record, "u4", 1), _disabled(record, axis.id))
     net.command(axis.id, table.NMT_START)
     axis.operational = True
 
@@ -95,18 +97,20 @@ def set_up(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
 def _check_identity(net: Net, axis: DriveAxis) -> Steps:
     kind = (yield from net.read(axis.id, table.DEVICE_TYPE)) & 0xFFFF
     if kind != table.DRIVE_PROFILE:
-        raise Unfit(f"node {axis.id} is no CiA 402 drive: its device type (1000h) names profile {kind}")
+        raise DeviceUnusable(f"node {axis.id} is no CiA 402 drive: its device type (1000h) names profile {kind}")
     identity: tuple[int, ...] = ()
     for entry in table.IDENTITY:
         identity += ((yield from _read(net, axis.id, entry)),)
     if axis.identity and identity != axis.identity:
-        raise Unfit(f"another drive answers as node {axis.id}: {_name_of(identity)}, not {_name_of(axis.identity)}")
+        raise DeviceUnusable(
+            f"another drive answers as node {axis.id}: {_name_of(identity)}, not {_name_of(axis.identity)}"
+        )
     try:
         name = yield from net.read_text(axis.id, table.DEVICE_NAME)
-    except Refused:
+    except DriveRefused:
         name = axis.joint.model  # it reports none, which is allowed
     if name != axis.joint.model:
-        raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
+        raise DeviceUnusable(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
     yield from _check_fingerprint(net, axis, identity)
     axis.identity = identity
 
@@ -115,15 +119,15 @@ def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> St
     """Checks the serial number and firmware, as far as the robot file has them."""
     joint, (_, _, _, serial_number) = axis.joint, identity
     if joint.serial_number is not None and serial_number != joint.serial_number:
-        raise Another("serial_number", str(joint.serial_number), str(serial_number), "drive")
+        raise DifferentMotor("serial_number", str(joint.serial_number), str(serial_number), "drive")
     if joint.firmware is None:
         return
     try:
         firmware = yield from net.read_text(axis.id, table.SOFTWARE_VERSION)
-    except Refused:
-        raise Unfit("it reports no firmware version (100Ah); leave this key out", ".firmware") from None
+    except DriveRefused:
+        raise DeviceUnusable("it reports no firmware version (100Ah); leave this key out", ".firmware") from None
     if firmware != joint.firmware:
-        raise Another("firmware", joint.firmware, firmware, "drive")
+        raise DifferentMotor("firmware", joint.firmware, firmware, "drive")
 
 
 def _name_of(identity: Sequence[int]) -> str:
@@ -135,16 +139,18 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
     modes = yield from _read(net, axis.id, table.SUPPORTED_MODES, 1 << table.PROFILE_POSITION - 1)
     axis.modes = frozenset(mode for mode in range(1, 33) if modes >> mode - 1 & 1)
     if table.PROFILE_POSITION not in axis.modes:
-        raise Unfit("it has no profile position mode (6502h)")
+        raise DeviceUnusable("it has no profile position mode (6502h)")
     low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
     high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
     if low > high or low == high != 0:
-        raise Unfit(f"its own range is impossible: 607Dh = {low} to {high}; set it to what is true, or both to 0")
+        raise DeviceUnusable(
+            f"its own range is impossible: 607Dh = {low} to {high}; set it to what is true, or both to 0"
+        )
     axis.own_range = (low, high) if low < high else None
     if low < high and (axis.low < low or axis.high > high):
         ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         joint = axis.joint
-        raise Unfit(
+        raise DeviceUnusable(
             f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the drive's own range (607Dh), "
             f"{ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other"
         )
@@ -152,7 +158,7 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
     if 0 < fastest < axis.speed_counts:
         limit = fastest * axis.resolution.rad_s
         problem = f"{axis.joint.max_speed_rad_s:.6g} is above the drive's own limit {limit:.4g} (607Fh)"
-        raise Unfit(problem, ".max_speed_rad_s")
+        raise DeviceUnusable(problem, ".max_speed_rad_s")
 
 
 def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
@@ -190,7 +196,7 @@ def _map_first(net: Net, axis: DriveAxis) -> Steps:
         net.command(axis.id, table.NMT_PREOPERATIONAL)
     try:
         yield from _map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
-    except Refused as refused:
+    except DriveRefused as refused:
         if refused.code != table.NOT_IN_THIS_STATE:
             raise
         net.command(axis.id, table.NMT_PREOPERATIONAL)
@@ -204,7 +210,7 @@ def _map_streams(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
     if axis.turning_mode != table.PROFILE_POSITION:
         try:
             yield from _map(net, axis.id, table.TURNING, table.AT_EVENT, 0)
-        except Refused:
+        except DriveRefused:
             axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY}
     if axis.turning_mode == table.PROFILE_POSITION:
         yield from _map(net, axis.id, table.BRAKING, table.AT_EVENT, 0)
@@ -213,11 +219,11 @@ def _map_streams(net: Net, axis: DriveAxis, bus: CanBus) -> Steps:
             for entry, value in zip(table.INTERPOLATION_PERIOD, interpolation_period(bus.rate_hz), strict=True):
                 yield from net.write(axis.id, entry, value)
             yield from _map(net, axis.id, table.FOLLOWING, table.AT_NEXT_SYNC, 0)
-        except Refused:
+        except DriveRefused:
             axis.modes -= {table.CYCLIC_POSITION}
     if table.CYCLIC_POSITION not in axis.modes:
         record = table.FOLLOWING.communication
-        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+        yield from _try_write(net, axis.id, DictionaryEntry(record, "u4", 1), _disabled(record, axis.id))
 
 
 def heartbeat_ms(bus: CanBus) -> int:
@@ -228,13 +234,13 @@ def heartbeat_ms(bus: CanBus) -> int:
 def _map(net: Net, node: int, pdo: Pdo, kind: int, flags: int) -> Steps:
     """Maps a PDO in the order that drives require: invalid, empty, filled, counted, valid."""
     record, mapping, cob = pdo.communication, pdo.communication + 0x200, pdo.base + node | flags
-    yield from net.write(node, Entry(record, "u4", 1), cob | table.INVALID)
-    yield from net.write(node, Entry(record, "u1", 2), kind)
-    yield from net.write(node, Entry(mapping, "u1", 0), 0)
+    yield from net.write(node, DictionaryEntry(record, "u4", 1), cob | table.INVALID)
+    yield from net.write(node, DictionaryEntry(record, "u1", 2), kind)
+    yield from net.write(node, DictionaryEntry(mapping, "u1", 0), 0)
     for place, word in enumerate(pdo.mapping(), 1):
-        yield from net.write(node, Entry(mapping, "u4", place), word)
-    yield from net.write(node, Entry(mapping, "u1", 0), len(pdo.entries))
-    yield from net.write(node, Entry(record, "u4", 1), cob)
+        yield from net.write(node, DictionaryEntry(mapping, "u4", place), word)
+    yield from net.write(node, DictionaryEntry(mapping, "u1", 0), len(pdo.entries))
+    yield from net.write(node, DictionaryEntry(record, "u4", 1), cob)
 
 
 def _disabled(record: int, node: int) -> int:
@@ -242,17 +248,17 @@ def _disabled(record: int, node: int) -> int:
     return table.INVALID | (base + node)
 
 
-def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
+def _read(net: Net, node: int, entry: DictionaryEntry, default: int = 0) -> Answer[int]:
     """Reads an optional object."""
     value = yield from read_optional(net, node, entry)
     return default if value is None else value
 
 
-def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:
+def _try_write(net: Net, node: int, entry: DictionaryEntry, value: int) -> Steps:
     """Writes an optional object; the drive's own value is acceptable, too."""
     try:
         yield from net.write(node, entry, value)
-    except Refused:
+    except DriveRefused:
         return
 
 
@@ -328,7 +334,7 @@ class Admission:
         except NoAnswer as silent:
             self.axis.unfit = ""
             self._try_later(silent)
-        except (Unfit, Refused) as unfit:
+        except (DeviceUnusable, DriveRefused) as unfit:
             self.axis.fault = self.axis.unfit = str(unfit)  # replaces an earlier fault, as this must be fixed first
             self._try_later(unfit)
 
@@ -341,7 +347,9 @@ class Admission:
             _log.info("%s answers on %s", axis.name, axis.bus)
             axis.welcome(now_ns)
         elif now_ns - axis.set_up_ns > max(_UNHEARD_NS, 2 * self._exchange.silent_after_ns):
-            problem = Unfit(f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used")
+            problem = DeviceUnusable(
+                f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used"
+            )
             self._exchange.problems[axis] = problem
             axis.fault, axis.ready = str(problem), False
             axis.forget(now_ns)

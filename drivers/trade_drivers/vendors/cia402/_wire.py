@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError
 from trade_drivers.bus.can import Listeners
 from trade_drivers.joints import Gate
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.cia402._table import DictionaryEntry
 
 _SIZE: Final = 8
 _EXPEDITED: Final = 4
@@ -120,7 +120,7 @@ class NoAnswer(Exception):
     """A drive did not answer this request in time."""
 
 
-class Refused(Exception):
+class DriveRefused(Exception):
     """A drive refused a request."""
 
     def __init__(self, entry: object, code: int, text: str) -> None:
@@ -162,7 +162,7 @@ class Net:
         """Sends a network management command, such as start; it has no confirmation."""
         self._port.send(table.NMT, bytes((word, node)))
 
-    def read(self, node: int, entry: Entry) -> Answer[int]:
+    def read(self, node: int, entry: DictionaryEntry) -> Answer[int]:
         """Reads a number from a drive's dictionary.
 
         Raises:
@@ -170,7 +170,7 @@ class Net:
         """
         data = yield from self._ask(node, entry, lambda: upload(entry.index, entry.sub))
         if len(data) < entry.size:
-            raise Refused(entry, 0, f"it came with {len(data)} bytes, not {entry.size}")
+            raise DriveRefused(entry, 0, f"it came with {len(data)} bytes, not {entry.size}")
         return entry.decode(data)
 
     def read_text(self, node: int, index: int) -> Answer[str]:
@@ -178,7 +178,7 @@ class Net:
         data = yield from self._ask(node, f"{index:04X}h", lambda: upload(index, 0))
         return data.rstrip(b"\0 ").decode("ascii", "replace")
 
-    def write(self, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Answer[None]:
+    def write(self, node: int, entry: DictionaryEntry, value: int, gate: Gate = lambda: None) -> Answer[None]:
         """Writes a number to a drive's dictionary, with retries; the gate is called before each attempt."""
 
         def gated_download() -> Transfer:
@@ -192,7 +192,7 @@ class Net:
             try:
                 data = yield from self._transfer(node, begin())
             except Aborted as refused:
-                raise Refused(entry, refused.code, str(SdoAbortedError(refused.code))) from None
+                raise DriveRefused(entry, refused.code, str(SdoAbortedError(refused.code))) from None
             if data is not None:
                 return data
         raise NoAnswer(f"{entry}: no answer within {_ATTEMPTS * _ANSWER_S * 1e3:.0f} ms")

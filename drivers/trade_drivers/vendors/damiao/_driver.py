@@ -5,7 +5,7 @@ from math import isclose
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from trade_drivers.commissioning._can_scan import CanBench
-from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.commissioning._commissioner import ScannedDevice
 from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _table as table
@@ -43,7 +43,7 @@ class DamiaoBench(CanBench):
     def anybody(self) -> bool:
         return True
 
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         try:
             answers = self._register(device_id, Register.POSITION_MAX)
         except _Silent:

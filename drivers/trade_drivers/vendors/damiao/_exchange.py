@@ -13,20 +13,20 @@ from trade_drivers.bus._cycle import HALT_NS
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, frame_bits
 from trade_drivers.joints import (
+    AwaitedJob,
     ControlMode,
+    DeviceUnusable,
     Gate,
     Goal,
     Motion,
     Ramp,
     Steps,
-    Unfit,
-    Work,
     check_joints,
     check_rate,
     next_measurement,
     until,
 )
-from trade_drivers.joints.can import Another, check_keys, check_load
+from trade_drivers.joints.can import DifferentMotor, check_keys, check_load
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _table as table
@@ -58,15 +58,15 @@ def check_bus(bus: CanBus, axes: Sequence[DamiaoAxis], where: str) -> None:
 def _check_joint(axis: DamiaoAxis) -> None:
     joint, ranges = axis.joint, axis.ranges
     if not 1 <= joint.id < table.MASTER:
-        raise Unfit(f"{joint.id} is not valid; use 1 to 15 (the motor answers as its id plus 16)", ".id")
+        raise DeviceUnusable(f"{joint.id} is not valid; use 1 to 15 (the motor answers as its id plus 16)", ".id")
     if joint.max_speed_rad_s * joint.gear > ranges.velocity_rad_s:
         most = ranges.velocity_rad_s / joint.gear
-        raise Unfit(
+        raise DeviceUnusable(
             f"{joint.max_speed_rad_s:.4g} is above {most:.4g}, the most a {joint.model} reports", ".max_speed_rad_s"
         )
     for key, value in ((".min_rad", joint.min_rad), (".max_rad", joint.max_rad)):
         if abs(axis.scale.counts(value)) * axis.resolution.rad * joint.gear > _WITHIN * ranges.position_rad:
-            raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can report", key)
+            raise DeviceUnusable(f"{value:.4g} is farther from its zero than a {joint.model} can report", key)
     check_keys(axis, "a Damiao motor", "radians")
 
 
@@ -170,7 +170,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     # --- enabling, relaxing and leaving: one exchange after the other
 
-    def enabling(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
+    def enabling(self, job: AwaitedJob[DamiaoAxis], axis: DamiaoAxis) -> Steps:
         """Switches torque on at the measured position in position-velocity mode; confirms each step."""
         yield from self.looking(axis)
         if axis.motion is not None and not axis.fault:
@@ -191,7 +191,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         yield from until(self, axis, lambda: axis.torque is True, "it cannot be enabled; is its power stage supplied?")
         axis.fault, axis.ready = "", True
 
-    def _set_up(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
+    def _set_up(self, job: AwaitedJob[DamiaoAxis], axis: DamiaoAxis) -> Steps:
         """Compares its scale, sets timeout and mode, each time: a restart, which is not reported, may change all."""
         yield from self._run_requests(axis, self.check_ranges(axis))
         job.gate()
@@ -204,7 +204,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         job.gate()
         yield from self._write(axis, Register.CONTROL_MODE, table.IN_POSITION_VELOCITY)
 
-    def relaxing(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
+    def relaxing(self, job: AwaitedJob[DamiaoAxis], axis: DamiaoAxis) -> Steps:
         """Switches torque off, which also idles the watchdog."""
         axis.ready = False
         job.gate()
@@ -213,7 +213,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             self.port.send(axis.id, frames.DISABLE)
         yield from until(self, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
 
-    def leaving(self, job: Work[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
+    def leaving(self, job: AwaitedJob[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
         """Switches torque off, or leaves it on for a joint seen at rest, and only then disarms the watchdog."""
         if relax:
             yield from self.relaxing(job, axis)
@@ -230,14 +230,14 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             raise axis.fault_error(f"it does not keep register {number:d}: {axis.answer}, not {value}")
 
     def _run_requests(self, axis: DamiaoAxis, asking: Steps) -> Steps:
-        """Runs register exchanges; raises ``DeviceSilent`` for a missing answer, and ``DeviceFault`` for ``Unfit``."""
+        """Runs register exchanges; raises ``DeviceSilent`` for no answer, ``DeviceFault`` for ``DeviceUnusable``."""
         try:
             for _ in asking:
                 self.idle(_WAIT_S)
                 yield
         except NoAnswer:
             raise axis.silent_error(self.clock()) from None
-        except Unfit as unfit:
+        except DeviceUnusable as unfit:
             raise axis.fault_error(str(unfit)) from None
 
     # --- identity and settings
@@ -252,13 +252,15 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         yield from self.check_ranges(axis)
         yield from self.register(axis, Register.SOFTWARE)
         if axis.software not in {None, axis.answer}:
-            raise Unfit(f"another motor answers as {axis.id}: its software is {axis.answer}, not {axis.software}")
+            raise DeviceUnusable(
+                f"another motor answers as {axis.id}: its software is {axis.answer}, not {axis.software}"
+            )
         axis.software = int(axis.answer or 0)
         if axis.joint.firmware is not None and axis.joint.firmware != str(axis.software):
-            raise Another("firmware", axis.joint.firmware, str(axis.software))
+            raise DifferentMotor("firmware", axis.joint.firmware, str(axis.software))
         yield from self.set_register(axis, Register.TIMEOUT, self.timeout)
         if axis.answer != self.timeout:
-            raise Unfit(f"it does not keep its time-out (register 9): {axis.answer}, not {self.timeout}")
+            raise DeviceUnusable(f"it does not keep its time-out (register 9): {axis.answer}, not {self.timeout}")
         axis.heard_ns = 0
         yield from self.request(axis, [self.refresh(axis)], lambda: axis.heard_ns > 0)
 
@@ -275,7 +277,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             if axis.answer is None or not isclose(axis.answer, meant, rel_tol=1e-3):
                 name = number.name.replace("_MAX", "").lower()
                 problem = f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to"
-                raise Unfit(f"{problem} {axis.answer:g} (register {number:d})", ".model")
+                raise DeviceUnusable(f"{problem} {axis.answer:g} (register {number:d})", ".model")
 
     def register(self, axis: DamiaoAxis, number: Register) -> Steps:
         """Requests a register; ``answer`` is then its value."""

@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import Talk
+    from trade_drivers.bus.can import FramesById
 
 BROADCAST: Final = 0x7FF
 """The identifier of register requests; the data contains the motor."""
@@ -25,9 +25,9 @@ FULL: Final = 1000
 """Steps of the torque in feedback."""
 
 
-def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - identifiers are unique to such drivers
+def orders(sniffed: "FramesById", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - identifiers are unique to such drivers
     """Returns the identifiers among the traffic that only a driver of such motors sends."""
-    return talk.frames.keys() & ({BROADCAST} | {base + motor for base in _MODES for motor in range(1, MASTER)})
+    return sniffed.frames.keys() & ({BROADCAST} | {base + motor for base in _MODES for motor in range(1, MASTER)})
 
 
 class Register(IntEnum):

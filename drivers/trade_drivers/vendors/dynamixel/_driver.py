@@ -8,8 +8,8 @@ from trade_drivers._validation import not_installed
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.joints import check_joints
 from trade_drivers.joints.serial import (
-    Kept,
     NoAnswer,
+    PersistentRegisters,
     ServoBench,
     ServoDriver,
     ServoExchange,
@@ -92,7 +92,7 @@ class DynamixelDriver(ServoDriver[DynamixelAxis, "Wire"]):
     name = "dynamixel"
     models = table.BY_MODEL_NAME
     bauds = table.BAUD_CODES
-    kept = Kept((table.ID.address, table.BAUD.address), table.name_of, table.firmware)
+    kept = PersistentRegisters((table.ID.address, table.BAUD.address), table.name_of, table.firmware)
     modules = ("dynamixel_sdk", "serial")
     commissioner = DynamixelCommissioner
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from trade.errors import ConfigurationError
-from trade_drivers.joints import Gate, Goal, Steps, Work
+from trade_drivers.joints import AwaitedJob, Gate, Goal, Steps
 from trade_drivers.joints.serial import NoAnswer, ServoExchange, check_own_range
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis, DynamixelHealth
@@ -71,7 +71,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
 
     # --- jobs: one exchange after the other
 
-    def enabling(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
+    def enabling(self, job: AwaitedJob[DynamixelAxis], axis: DynamixelAxis) -> Steps:
         """Switches torque on at the measured position with the joint's profile and an armed watchdog; all read back."""
         self.require_answering(axis)
         health = yield from self.read_health(axis)
@@ -95,7 +95,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
             raise axis.fault_error("it did not keep what enabling it wrote")
         axis.fault, axis.ready = "", True
 
-    def relaxing(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
+    def relaxing(self, job: AwaitedJob[DynamixelAxis], axis: DynamixelAxis) -> Steps:
         axis.ready = False  # first, since a health read in between would take torque off for a fault
         yield from self.write_register(job, axis, table.TORQUE_ENABLE, 0)
         yield from self.write_register(job, axis, table.BUS_WATCHDOG, 0)
@@ -103,7 +103,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         if health.torque:
             raise axis.fault_error("it did not relax: its torque is still on")
 
-    def leaving(self, job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
+    def leaving(self, job: AwaitedJob[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
         health = yield from self.read_health(axis)
         if relax and health.torque:
             axis.ready = False
@@ -114,7 +114,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
             yield from self.write_register(job, axis, table.BUS_WATCHDOG, 0)
         axis.ready = False
 
-    def _seed(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> bytes:
+    def _seed(self, job: AwaitedJob[DynamixelAxis], axis: DynamixelAxis) -> bytes:
         """Sets the goal to the measured position; measures again at each retry, as the joint may have sagged."""
         register = table.PRESENT_POSITION
         answer = self.wire.read(axis.id, register.address, register.size)
@@ -123,7 +123,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         self.wire.write(axis.id, _GOAL_BLOCK[0], block, job.gate)
         return block
 
-    def _restart(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:
+    def _restart(self, job: AwaitedJob[DynamixelAxis], axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:
         """Restarts a servo that has shut down, and returns its health; only that or a power cycle ends a shutdown."""
         axis.ready = False
         began_ns = self.clock()

@@ -18,7 +18,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHa
 
 from trade_drivers.bus._serial_port import SerialLine
 from trade_drivers.joints import Gate, PortLost
-from trade_drivers.joints.serial import Answer, BadAnswer, NoAnswer, Refused
+from trade_drivers.joints.serial import Answer, BadAnswer, NoAnswer, RequestRefused
 from trade_drivers.joints.serial._wire import BROADCAST, ServoWire
 from trade_drivers.vendors.dynamixel._table import BAUD_CODES, STATUS_ERRORS
 
@@ -267,7 +267,7 @@ class Wire(ServoWire):
         match result:
             case 0:
                 if number := error & ~_ALERT:
-                    raise Refused(device_id, STATUS_ERRORS.get(number, f"error number {number}"))
+                    raise RequestRefused(device_id, STATUS_ERRORS.get(number, f"error number {number}"))
             case -3001:
                 raise NoAnswer(device_id, 0.0)
             case -3002:

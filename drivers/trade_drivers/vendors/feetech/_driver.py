@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import ConfigurationError
 from trade_drivers._validation import not_installed
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
-from trade_drivers.joints import Unfit, check_joints
-from trade_drivers.joints.serial import Kept, ServoBench, ServoDriver, check_cycle, check_ranges
+from trade_drivers.joints import DeviceUnusable, check_joints
+from trade_drivers.joints.serial import PersistentRegisters, ServoBench, ServoDriver, check_cycle, check_ranges
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, RESOLUTION, FeetechAxis
 from trade_drivers.vendors.feetech._exchange import GOAL_BLOCK, FeetechExchange
@@ -85,7 +85,7 @@ class FeetechDriver(ServoDriver[FeetechAxis, "Wire"]):
     name = "feetech"
     models = table.BY_MODEL_NAME
     bauds = table.BAUD_CODES
-    kept = Kept((table.ID.address, table.BAUD.address), table.name_of, table.firmware)
+    kept = PersistentRegisters((table.ID.address, table.BAUD.address), table.name_of, table.firmware)
     modules = ("serial",)
     without_watchdog = "no watchdog: without its driver it continues to its last goal, which is never far ahead"
     commissioner = FeetechCommissioner
@@ -112,7 +112,7 @@ def _check_most(axis: FeetechAxis) -> None:
         (".max_accel_rad_s2", joint.max_accel_rad_s2, table.MOST_ACCELERATION * table.RAD_S2_PER_COUNT),
     ):
         if value > most:
-            raise Unfit(f"{value:.4g} is above {most:.4g}, the most an {joint.model} can be set to", key)
+            raise DeviceUnusable(f"{value:.4g} is above {most:.4g}, the most an {joint.model} can be set to", key)
 
 
 def _check_cycle(bus: SerialBus, count: int, where: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from trade.errors import ConfigurationError, TradeError
-from trade_drivers.joints import AxisMotion, Gate, Goal, Steps, Work
+from trade_drivers.joints import AwaitedJob, AxisMotion, Gate, Goal, Steps
 from trade_drivers.joints.serial import ServoExchange, check_own_range
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, FeetechAxis
@@ -50,7 +50,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
 
     # --- jobs: one exchange after the other
 
-    def enabling(self, job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
+    def enabling(self, job: AwaitedJob[FeetechAxis], axis: FeetechAxis) -> Steps:
         """Switches torque on at the measured position with the joint's acceleration and speed; reads all back."""
         self.require_answering(axis)
         health = yield from self.read_health(axis)
@@ -73,20 +73,20 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
             raise axis.fault_error("it did not keep what enabling it wrote")
         axis.fault, axis.ready = "", True
 
-    def relaxing(self, job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
+    def relaxing(self, job: AwaitedJob[FeetechAxis], axis: FeetechAxis) -> Steps:
         axis.ready = False  # first, since a health read in between would take torque off for a fault
         yield from self.write_register(job, axis, table.TORQUE, 0)
         health = yield from self.read_health(axis)
         if health.torque:
             raise axis.fault_error("it did not relax: its torque is still on")
 
-    def leaving(self, job: Work[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
+    def leaving(self, job: AwaitedJob[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
         """Switches torque off or leaves it on; there is no watchdog to disarm."""
         axis.ready = False
         if relax:
             yield from self.relaxing(job, axis)
 
-    def _seed(self, job: Work[FeetechAxis], axis: FeetechAxis) -> bytes:
+    def _seed(self, job: AwaitedJob[FeetechAxis], axis: FeetechAxis) -> bytes:
         """Sets the goal to the measured position, which may switch torque on; measures again at each retry."""
         asked_ns = self.clock()
         health = axis.take_health(self.wire.read(axis.id, *axis.slow).data, asked_ns)

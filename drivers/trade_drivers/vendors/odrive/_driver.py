@@ -4,7 +4,7 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.commissioning._can_scan import CanBench
-from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.commissioning._commissioner import ScannedDevice
 from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.odrive._frames import Heartbeat, Version, frame_id
@@ -29,12 +29,12 @@ class OdriveBench(CanBench):
         """Sends no requests to other nodes."""
 
     def anybody(self) -> bool:
-        return bool(self._talk.odrives) or self._nameless() is not None
+        return bool(self._sniffed.odrives) or self._nameless() is not None
 
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         if device_id == NODES:
             return self._nameless()
-        beat = self._talk.odrives.get(device_id)
+        beat = self._sniffed.odrives.get(device_id)
         if beat is None:
             return None
         torque = Heartbeat.decode(beat).state != State.IDLE
@@ -51,9 +51,9 @@ class OdriveBench(CanBench):
             problem="" if names else f"this driver knows {', '.join(MODELS)}",
         )
 
-    def _nameless(self) -> Found | None:
+    def _nameless(self) -> ScannedDevice | None:
         """Returns an ODrive that reported its serial number instead of a node."""
-        for data in self._talk.frames.get(frame_id(NODES, Command.ADDRESS), ()):
+        for data in self._sniffed.frames.get(frame_id(NODES, Command.ADDRESS), ()):
             if len(data) == struct.calcsize("<B6s"):
                 serial_number = int.from_bytes(data[1:], "little")
                 problem = f"it has no node number yet; give it one by {self.remedy}"

@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers.bus._cycle import HALT_NS
 from trade_drivers.bus.can import Frame, frame_bits
-from trade_drivers.joints import Gate, Goal, Steps, Unfit, Work, check_joints, check_rate, next_measurement, until
-from trade_drivers.joints.can import Another, check_keys, check_load
+from trade_drivers.joints import (
+    AwaitedJob,
+    DeviceUnusable,
+    Gate,
+    Goal,
+    Steps,
+    check_joints,
+    check_rate,
+    next_measurement,
+    until,
+)
+from trade_drivers.joints.can import DifferentMotor, check_keys, check_load
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._axis import COUNTS_PER_TURN, OdriveAxis
@@ -57,7 +67,7 @@ def check_bus(bus: CanBus, axes: Sequence[OdriveAxis], where: str) -> None:
 
 def _check_joint(axis: OdriveAxis) -> None:
     if not 0 <= axis.joint.id < NODES:
-        raise Unfit(f"{axis.joint.id} is no node; 0 to 62 are", ".id")
+        raise DeviceUnusable(f"{axis.joint.id} is no node; 0 to 62 are", ".id")
     check_keys(axis, "an ODrive", "turns")
 
 
@@ -132,7 +142,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
 
     # --- enabling, relaxing and leaving: one exchange after the other
 
-    def enabling(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+    def enabling(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis) -> Steps:
         """Switches torque on at the measured position after one test of the watchdog; heartbeats confirm each state.
 
         An axis that already has torque must be at rest, and keeps holding.
@@ -159,7 +169,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
             yield from self._arm(job, axis)
         axis.fault, axis.ready = "", True
 
-    def _arm(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+    def _arm(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis) -> Steps:
         job.gate()
         self.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
         since_ns = self.clock()
@@ -167,7 +177,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         if not axis.armed:
             raise axis.fault_error(f"it cannot be enabled: {axis.refusal}")
 
-    def _clear(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+    def _clear(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis) -> Steps:
         """Clears its errors, without arming it."""
         job.gate()
         self.tell(axis, Command.CLEAR_ERRORS, b"\0")
@@ -176,7 +186,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         yield from until(self, axis, lambda: axis.health_ns > since_ns and not axis.errors, stays)
         axis.disarmed_by = Errors(0)
 
-    def _try_watchdogs(self, job: Work[OdriveAxis], axes: Sequence[OdriveAxis]) -> Steps:
+    def _try_watchdogs(self, job: AwaitedJob[OdriveAxis], axes: Sequence[OdriveAxis]) -> Steps:
         """Tests the watchdogs, which no reading shows: arms axes without torque, and is silent until they disarm."""
         job.gate()
         for axis in axes:
@@ -200,7 +210,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
             yield from self._clear(job, axis)
             axis.proven = True
 
-    def _await_watchdog(self, job: Work[OdriveAxis], axis: OdriveAxis, give_up_ns: int) -> Steps:
+    def _await_watchdog(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis, give_up_ns: int) -> Steps:
         while not axis.errors:
             job.gate()
             self.require_answering(axis)
@@ -217,7 +227,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         if not axis.errors & Errors.WATCHDOG:
             raise axis.fault_error(f"it cannot be enabled: {axis.refusal}")
 
-    def relaxing(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+    def relaxing(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis) -> Steps:
         """Switches torque off, which also idles the watchdog."""
         axis.ready = False
         if axis.may_hold_torque:
@@ -225,7 +235,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
             self.tell(axis, Command.SET_STATE, frames.set_state(State.IDLE))
         yield from until(self, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
 
-    def leaving(self, job: Work[OdriveAxis], axis: OdriveAxis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
+    def leaving(self, job: AwaitedJob[OdriveAxis], axis: OdriveAxis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
         return self.relaxing(job, axis)
 
     # --- identity and requests
@@ -249,7 +259,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         if first and axis.torque:
             self.tell(axis, Command.SET_MODE, frames.set_mode(Control.VELOCITY, Input.VELOCITY_RAMP))
             self.tell(axis, Command.SET_VELOCITY, frames.set_velocity(0.0))
-            raise Unfit(
+            raise DeviceUnusable(
                 f"node {axis.id} is under torque although its watchdog was not fed: set axis0.config.enable_watchdog; "
                 "it was stopped, and is left under torque"
             )
@@ -280,12 +290,12 @@ def _check_version(axis: OdriveAxis) -> None:
     if version is None:
         return
     if version.line != axis.model.line:
-        raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} is of product line {version.line}", ".model")
+        raise DeviceUnusable(f"is {axis.joint.model!r}, but node {axis.id} is of product line {version.line}", ".model")
     firmware = ".".join(map(str, version.firmware))
     if version.firmware[:2] != _FIRMWARE:
-        raise Unfit(f"the firmware of node {axis.id} is {firmware}; this driver speaks CANSimple of 0.6")
+        raise DeviceUnusable(f"the firmware of node {axis.id} is {firmware}; this driver speaks CANSimple of 0.6")
     if axis.joint.firmware is not None and axis.joint.firmware != firmware:
-        raise Another("firmware", axis.joint.firmware, firmware)
+        raise DifferentMotor("firmware", axis.joint.firmware, firmware)
     if axis.identity not in {None, version}:
-        raise Unfit(f"another ODrive answers as node {axis.id}: {version}, not {axis.identity}")
+        raise DeviceUnusable(f"another ODrive answers as node {axis.id}: {version}, not {axis.identity}")
     axis.identity = version

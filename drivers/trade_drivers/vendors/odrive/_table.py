@@ -8,7 +8,7 @@ from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import Talk
+    from trade_drivers.bus.can import FramesById
 
 NODES: Final = 63
 """The value for a missing node number; valid ones are lower."""
@@ -67,15 +67,15 @@ ORDERS: Final = frozenset(
 )
 
 
-def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
+def orders(sniffed: "FramesById", nodes: Iterable[int] = ()) -> set[int]:
     """Returns identifiers that only a driver sends, for these nodes or those that send heartbeats.
 
     Requests are included: they feed the watchdog of an axis, which then would miss the death of its driver.
     """
-    known = {*nodes, *talk.odrives}
+    known = {*nodes, *sniffed.odrives}
     return {
         can_id
-        for can_id, frames in talk.frames.items()
+        for can_id, frames in sniffed.frames.items()
         if can_id >> 5 in known and (can_id & 0x1F in ORDERS or not all(frames))
     }
 

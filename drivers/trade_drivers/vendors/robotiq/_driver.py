@@ -9,9 +9,9 @@ from trade.errors import ConfigurationError, DeviceAbsent, DeviceSilent
 from trade_drivers._validation import finite, not_installed, within
 from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._gate import admitted, at_once, span
-from trade_drivers.bus._jobs import NoAnswer, Refused
+from trade_drivers.bus._jobs import NoAnswer, RequestRefused
 from trade_drivers.bus._thread import BusThread, opening, start_thread
-from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found
+from trade_drivers.commissioning._commissioner import Bench, Commissioner, ScannedDevice
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState, JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
 from trade_drivers.vendors.robotiq import _table as table
@@ -125,20 +125,22 @@ class RobotiqBench(Bench):
     def anybody(self) -> bool:
         return True
 
-    def look(self, device_id: int) -> Found | None:
+    def look(self, device_id: int) -> ScannedDevice | None:
         try:
             status = table.Status.decode(self._wire.read(device_id), 0)
         except NoAnswer:
             self._wire.settled_at = 0.0  # a late answer must not be taken for that of the next id
             return None
-        except Refused:
+        except RequestRefused:
             return self._found(device_id, "", "it is a Modbus device, but no 2F-85")
         if not status.plausible:
             return self._found(device_id, "", "it has the registers of a 2F-85, but what they read makes no sense")
         return self._found(device_id, "2F-85", "")
 
-    def _found(self, device_id: int, model: str, problem: str) -> Found:
-        return Found(driver="robotiq", kind="gripper", baud=self._baud, id=device_id, model=model, problem=problem)
+    def _found(self, device_id: int, model: str, problem: str) -> ScannedDevice:
+        return ScannedDevice(
+            driver="robotiq", kind="gripper", baud=self._baud, id=device_id, model=model, problem=problem
+        )
 
     def angle_rad(self, device_id: int) -> NoReturn:
         self._cannot(device_id, "a gripper has no angle; its widths are known, so there is nothing to calibrate")
@@ -279,7 +281,7 @@ def _verify(exchange: Exchange, device: GripperDevice, bus: SerialBus, where: st
             exchange.read(device)  # two measurements show motion
         except NoAnswer:
             continue
-        except Refused as refused:
+        except RequestRefused as refused:
             _wrong(key, f"what answers on bus {bus.name!r} is no 2F-85: {refused}")
         if device.sample is not None and not device.sample.plausible:
             _wrong(key, f"what answers to id {device.id} on bus {bus.name!r} is no 2F-85: its status makes no sense")

@@ -12,7 +12,7 @@ from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeU
 from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._gate import Command, Terms
-from trade_drivers.bus._jobs import Device, Gate, NoAnswer, Refused, Steps
+from trade_drivers.bus._jobs import Device, Gate, NoAnswer, RequestRefused, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper import GripperDevice, GripperMotion
 from trade_drivers.vendors.robotiq._table import Contact, Status
@@ -144,7 +144,7 @@ class Exchange(BusCycle[GripperDevice]):
                 raise
             except NoAnswer:
                 yield
-            except Refused as refused:
+            except RequestRefused as refused:
                 raise device.fault_error(f"it is no 2F-85: {refused}") from None
             else:
                 yield
@@ -174,7 +174,7 @@ class Exchange(BusCycle[GripperDevice]):
                 if device.doubted or device.silent:
                     self.probe(device)
                 self.read(device)
-            except Refused as refused:
+            except RequestRefused as refused:
                 device.fault = f"it is no 2F-85: {refused}"
                 return
             if device.silent:
@@ -218,7 +218,7 @@ class Exchange(BusCycle[GripperDevice]):
         now_ns = self.clock()
         device.still, device.held_ns = 0, now_ns
         device.halting_since_ns = device.halting_since_ns or now_ns
-        with suppress(NoAnswer, Refused):
+        with suppress(NoAnswer, RequestRefused):
             self.write(device, values, wait=False)
 
     def _forget(self, motion: GripperMotion, error: TradeError | None) -> None:

@@ -6,7 +6,7 @@ from typing import Final, Literal
 from trade import Resource
 from trade.errors import DeviceFault
 from trade_drivers.bus._cycle import BusDevice
-from trade_drivers.bus._jobs import Work
+from trade_drivers.bus._jobs import AwaitedJob
 from trade_drivers.interfaces._motion import GripperState
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._table import Contact, Status
@@ -129,7 +129,7 @@ class GripperDevice(BusDevice[Status]):
         )
 
 
-class GripperMotion(Work[GripperDevice]):
+class GripperMotion(AwaitedJob[GripperDevice]):
     """A motion of the fingers, as far as the gripper knows it."""
 
     def watch(self, now_ns: int) -> None:

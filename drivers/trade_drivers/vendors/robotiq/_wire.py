@@ -15,7 +15,7 @@ from pymodbus.client import ModbusSerialClient
 from pymodbus.framer import FramerRTU
 from pymodbus.pdu import ModbusPDU
 
-from trade_drivers.bus._jobs import Gate, NoAnswer, Refused
+from trade_drivers.bus._jobs import Gate, NoAnswer, RequestRefused
 from trade_drivers.bus._serial_port import DRAIN_S, LONGEST_WAIT_S, SerialLine, SerialWire
 from trade_drivers.vendors.robotiq import _table as table
 
@@ -143,7 +143,7 @@ class Wire(SerialWire):
                 raise NoAnswer(device_id, time.monotonic() - began) from None
         if answer.isError():
             reason = f"id {device_id} answered with exception {answer.exception_code}, which a 2F-85 never does"
-            raise Refused(device_id, reason)
+            raise RequestRefused(device_id, reason)
         self._in_a_row = 0
         return list(answer.registers)
 

@@ -172,9 +172,9 @@ class UrArm(Arm):
         speed = most if speed_rad_s is None else finite(speed_rad_s, service, "speed_rad_s")
         return within(speed, 1e-3, most, f"{self._name} speed", "rad/s")
 
-    def _move(self, kind: type[Move], goal: list[float], speed: float, service: str) -> ArmState:
+    def _move(self, move_type: type[Move], goal: list[float], speed: float, service: str) -> ArmState:
         with admitted(service, self.resources, self._span()) as terms:
-            self._finish(kind(self._exchange, goal, speed, terms))
+            self._finish(move_type(self._exchange, goal, speed, terms))
         return self.state()
 
     def _switch(self, line: str, expected: str, reached: Callable[[], bool]) -> None:

@@ -13,7 +13,7 @@ from trade.errors import ConfigurationError, DeviceAbsent
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.commissioning._commissioner import ScannedDevice
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
@@ -176,7 +176,7 @@ def _wrong(where: str, problem: str) -> NoReturn:
     raise ConfigurationError(where=where, problem=problem)
 
 
-def identify(host: str) -> Found:
+def identify(host: str) -> ScannedDevice:
     """Returns a controller's arm: model, software version, serial number.
 
     Raises:
@@ -190,7 +190,7 @@ def identify(host: str) -> Found:
     except DashboardError as bad:
         raise ConfigurationError(where=host, problem=f"no controller of an arm answers: {bad}") from None
     e_series = version is not None and int(version[1]) >= _E_SERIES
-    return Found(
+    return ScannedDevice(
         driver="ur",
         kind="arm",
         model=f"{model.rstrip('e')}e" if e_series else model,

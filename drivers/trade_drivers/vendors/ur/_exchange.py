@@ -127,19 +127,19 @@ class Exchange(BusCycle[ArmStatus]):
         self.limb.halting_since_ns = self._halt_number = 0
         self.taken = self._ending = False
 
-    def drop_control(self, why: str) -> None:
+    def drop_control(self, reason: str) -> None:
         """Replaces the process that commands by a fresh one; the robot's watchdog stops its motion.
 
         A program paused by a safeguard stop would resume by itself, so the dashboard ends it, too.
         """
         if self.taken:
-            _log.warning("%s: %s; its watchdog stops it", self.limb.name, why)
+            _log.warning("%s: %s; its watchdog stops it", self.limb.name, reason)
             self._end_program()
         self.taken, self._ending, self._halt_number = False, False, 0
         self.link.renew_control()
         if self.limb.motion is not None:
             self.limb.halting_since_ns = self.clock()
-            self._forget(self.limb.motion, self.limb.fault_error("" if self.limb.fault else why))
+            self._forget(self.limb.motion, self.limb.fault_error("" if self.limb.fault else reason))
 
     # --- orders
 

@@ -132,10 +132,10 @@ class Channel(Generic[Message]):
         kind: what is received.
     """
 
-    def __init__(self, end: socket.socket, kind: object) -> None:
+    def __init__(self, end: socket.socket, type_: object) -> None:
         self.end = end
         self._encoder = msgspec.msgpack.Encoder()
-        self._decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(kind)  # pyright: ignore[reportArgumentType]
+        self._decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(type_)  # pyright: ignore[reportArgumentType]
 
     def send(self, message: Struct) -> None:
         """Sends a message, or raises ``Disconnected``; never waits."""

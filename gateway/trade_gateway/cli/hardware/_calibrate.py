@@ -108,7 +108,7 @@ def _import(
     _write(out, path, before, changed, yes=yes)
 
 
-class Ends(Struct, frozen=True):
+class TravelEnds(Struct, frozen=True):
     """The ends that a device was moved to, in its own direction.
 
     A device that passes the end of its encoder counts further here: ``low`` or ``high`` is then beyond half a turn.
@@ -133,7 +133,7 @@ class Sweep:
     def __init__(self, bench: Bench, device_id: int, where: str, patience_s: float = _PATIENCE_S) -> None:
         self._bench, self._id, self._where, self._patience_s = bench, device_id, where, patience_s
 
-    def until(self, done: Callable[[], bool], longest_s: float) -> Ends:
+    def until(self, done: Callable[[], bool], longest_s: float) -> TravelEnds:
         """Reads positions until a condition holds.
 
         Raises:
@@ -153,7 +153,7 @@ class Sweep:
                     "it turns by more than a whole turn, which one robot joint here cannot; move it between its ends"
                 )
                 raise ConfigurationError(where=self._where, problem=problem)
-        return Ends(low, high, last)
+        return TravelEnds(low, high, last)
 
     def still(self) -> float:
         """Returns the position of a device that is held still, from two readings.
@@ -190,7 +190,7 @@ class Sweep:
             time.sleep(_AGAIN_S)
 
 
-def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, float]:
+def measured(joint: Joint, zero: float | None, ends: TravelEnds | None) -> dict[str, float]:
     """Returns the values of a joint's keys that change.
 
     Args:
@@ -215,7 +215,7 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
     return {key: round(value, _DIGITS) + 0.0 for key, value in values.items()}
 
 
-def _across(joint: Joint, ends: Ends) -> str:
+def _across(joint: Joint, ends: TravelEnds) -> str:
     """Says how to bring the middle of a range to the centre of the encoder.
 
     The offset of a Feetech servo moves the end of its encoder; that of a Dynamixel does not.

@@ -12,9 +12,9 @@ from trade_drivers import (
     CanBus,
     Commissioner,
     Driver,
-    Found,
     Joint,
     Robot,
+    ScannedDevice,
     SerialBus,
     UrBus,
     WireError,
@@ -200,7 +200,7 @@ def _of_device(bench: Bench, device: Joint | Gripper, bus: SerialBus) -> Finding
     return _identity(about, device, good[0])
 
 
-def _identity(about: str, device: Joint | Gripper, found: Found) -> Finding:
+def _identity(about: str, device: Joint | Gripper, found: ScannedDevice) -> Finding:
     firmware = device.firmware if isinstance(device, Joint) else None
     for key, expected, actual in (("model", device.model, found.model), ("firmware", firmware, found.firmware)):
         if expected is not None and expected != actual:

@@ -7,7 +7,7 @@ from typing import Final
 import msgspec
 
 from trade.errors import ConfigurationError
-from trade_drivers import Found, parse
+from trade_drivers import ScannedDevice, parse
 
 UNMEASURED_RAD: Final = 0.1
 """The placeholder range of a joint that was not measured, to both sides of zero."""
@@ -21,7 +21,7 @@ name = "robot"
 """
 
 
-def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
+def first_file(found: Sequence[tuple[str, ScannedDevice]], path: Path) -> str:
     """Returns the text of a robot file with these devices, each with its port.
 
     Raises:
@@ -54,7 +54,7 @@ def _table(name: str, keys: Iterable[str]) -> str:
     return "\n".join(["", f"[{name}]", *keys, ""])
 
 
-def _bus(port: str, one: Found) -> list[str]:
+def _bus(port: str, one: ScannedDevice) -> list[str]:
     if one.kind == "arm":
         return [f"driver = {_text(one.driver)}", f"host = {_text(port)}    # set it to remote control"]
     if one.wire == "can":
@@ -67,7 +67,7 @@ def _bus(port: str, one: Found) -> list[str]:
     return [f"driver = {_text(one.driver)}", *keys]
 
 
-def _joint(one: Found) -> list[str]:
+def _joint(one: ScannedDevice) -> list[str]:
     keys = [f"id = {one.id}", f"model = {_text(one.model)}"]
     if one.firmware:
         keys.append(f"firmware = {_text(one.firmware)}      # any other is refused as another device")
@@ -99,7 +99,7 @@ def _counts_per_rev(reported: float | None) -> str:
     return f"counts_per_rev = {reported:.12g}   # per motor turn, as the drive says"
 
 
-def _gripper(one: Found) -> list[str]:
+def _gripper(one: ScannedDevice) -> list[str]:
     return [
         f"id = {one.id}",
         f"model = {_text(one.model)}",
@@ -109,7 +109,7 @@ def _gripper(one: Found) -> list[str]:
     ]
 
 
-def _arm(one: Found) -> list[str]:
+def _arm(one: ScannedDevice) -> list[str]:
     return [
         f"model = {_text(one.model)}",
         "min_rad = [-3.1, -3.1, -2.8, -3.1, -3.1, -3.1]    # from the base to the tool",

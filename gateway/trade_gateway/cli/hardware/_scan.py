@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
-from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
+from trade_drivers import AnyDriver, Commissioner, ScannedDevice, drivers, load_driver
 from trade_drivers import scan as scan_line
 from trade_gateway._usage import UsageError
 from trade_gateway.cli.hardware._robot_file_template import first_file
@@ -38,7 +38,7 @@ Baud = Annotated[
 Model = Annotated[str | None, typer.Option(rich_help_panel=SELECT, help="Refuse if the device is of another model.")]
 
 
-class FoundOnPort(Found, frozen=True, kw_only=True):
+class FoundOnPort(ScannedDevice, frozen=True, kw_only=True):
     """A device, with the port that it was found on."""
 
     port: str
@@ -184,9 +184,11 @@ def commissioners(name: str | None) -> dict[str, Commissioner]:
     return found
 
 
-def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int], ids: Sequence[int]) -> list[Found]:
+def _scan_port(
+    out: Output, port: str, driver: str | None, bauds: Sequence[int], ids: Sequence[int]
+) -> list[ScannedDevice]:
     """Scans with each driver until one finds devices; on a CAN bus, which can have several kinds, with all."""
-    everything: list[Found] = []
+    everything: list[ScannedDevice] = []
     wire = "can" if _CAN.fullmatch(port) and not Path(port).exists() else "serial"
     for name, commissioner in commissioners(driver).items():
         if commissioner.wire != wire:
@@ -212,7 +214,7 @@ def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int],
     return everything
 
 
-def _arm(host: str) -> Found:
+def _arm(host: str) -> ScannedDevice:
     from trade_drivers.vendors.ur import identify  # noqa: PLC0415 - loads what other commands do not need
 
     return identify(host)
@@ -220,7 +222,7 @@ def _arm(host: str) -> Found:
 
 def _one(
     port: str, device_id: int, baud: int | None, driver: str | None, model: str | None
-) -> tuple[Commissioner, Found]:
+) -> tuple[Commissioner, ScannedDevice]:
     """Returns the only device of an id on a line, and its commissioner."""
     where = f"{port}, id {device_id}"
     found = _scan_port(Output(as_json=True), port, driver, [] if baud is None else [baud], [device_id])
@@ -238,7 +240,7 @@ def _one(
     return commissioners(found[0].driver)[found[0].driver], found[0]
 
 
-def _print(out: Output, now: Found, text: str) -> None:
+def _print(out: Output, now: ScannedDevice, text: str) -> None:
     if out.as_json:
         out.data(now)
     out.say(escape(text))

@@ -91,7 +91,7 @@ def lock(
     if not command:
         raise UsageError(where="trade lock", problem="say what to run: trade lock rosie.head -- python look.py")
     wanted = _wanted(group, name or [])
-    running = _Running(command)
+    running = _LockedCommand(command)
     with visitor_among_others(context) as container:
         held = container.lock(
             wanted,
@@ -125,7 +125,7 @@ def _chosen(choice: SystemChoice) -> dict[str, str]:
     return {**({"TRADE_SYSTEM": choice.system} if choice.system else {}), **connect}
 
 
-class _Running:
+class _LockedCommand:
     """The command's process, and the signals that are forwarded to it."""
 
     def __init__(self, command: Sequence[str]) -> None:

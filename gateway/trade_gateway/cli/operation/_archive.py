@@ -35,7 +35,7 @@ _PIECE: Final = 1024 * 1024
 _FOLDER_MODES: Final = {CONFIG: 0o755, STATE: 0o700}
 
 
-class Entry(Struct, frozen=True):
+class ArchivedFile(Struct, frozen=True):
     """One file of the archive."""
 
     path: str
@@ -68,7 +68,7 @@ class Manifest(Struct, frozen=True):
     made_at: str
     file: str
     """The path of the gateway file in the archive."""
-    files: list[Entry]
+    files: list[ArchivedFile]
 
 
 class Source(NamedTuple):
@@ -172,14 +172,14 @@ def unpack(
     return sorted(unknown)
 
 
-def _make_folder(folder: Path, entry: Entry, unknown: set[str]) -> None:
+def _make_folder(folder: Path, entry: ArchivedFile, unknown: set[str]) -> None:
     if not folder.exists():
         _make_folder(folder.parent, entry, unknown)
         folder.mkdir(_FOLDER_MODES[entry.part])
         _give(folder, entry, unknown)
 
 
-def _give(path: Path, entry: Entry, unknown: set[str]) -> None:
+def _give(path: Path, entry: ArchivedFile, unknown: set[str]) -> None:
     """Changes the owner, if this process is root."""
     if os.geteuid() == 0:
         try:
@@ -188,11 +188,11 @@ def _give(path: Path, entry: Entry, unknown: set[str]) -> None:
             unknown.add(f"{entry.owner}:{entry.group}")
 
 
-def _entry(source: Source) -> Entry:
+def _entry(source: Source) -> ArchivedFile:
     status, seen = source.status, hashlib.sha256()
     with source.content.open("rb") as content:
         size = sum(len(piece) for piece in _pieces(content, seen.update))
-    return Entry(
+    return ArchivedFile(
         path=source.path,
         size=size,
         sha256=seen.hexdigest(),
@@ -240,7 +240,7 @@ def _opened(path: Path) -> "Generator[tuple[tarfile.TarFile, Manifest]]":
         raise _refused(path, str(damaged)) from None
 
 
-def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator[tuple[tarfile.TarInfo, Entry]]:
+def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator[tuple[tarfile.TarInfo, ArchivedFile]]:
     """Returns the files after the manifest. Raises ConfigurationError if they differ from it."""
     missing = {entry.path: entry for entry in manifest.files}
     for member in itertools.islice(archive, 1, None):
@@ -253,7 +253,7 @@ def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator
 
 
 def _copy(
-    path: Path, archive: tarfile.TarFile, member: tarfile.TarInfo, entry: Entry, to: Callable[[bytes], object]
+    path: Path, archive: tarfile.TarFile, member: tarfile.TarInfo, entry: ArchivedFile, to: Callable[[bytes], object]
 ) -> None:
     """Reads a file of the archive. Raises ConfigurationError if it differs from the manifest."""
     if not member.isreg() or member.size != entry.size:
@@ -277,5 +277,5 @@ def _stays_inside(path: str) -> bool:
     return len(parts) > 1 and parts[0] in (CONFIG, STATE) and ".." not in parts and "/".join(parts) == path
 
 
-def _refused(path: Path, why: str) -> ConfigurationError:
-    return ConfigurationError(where=str(path), problem=f"is no backup, or a damaged one: {why}; use another one")
+def _refused(path: Path, reason: str) -> ConfigurationError:
+    return ConfigurationError(where=str(path), problem=f"is no backup, or a damaged one: {reason}; use another one")

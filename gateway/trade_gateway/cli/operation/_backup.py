@@ -30,7 +30,7 @@ from trade_gateway.cli.operation._archive import (
     unpack,
     write_archive,
 )
-from trade_gateway.cli.operation._file_closure import Named, named_files
+from trade_gateway.cli.operation._file_closure import NamedFiles, named_files
 from trade_gateway.supervisor._single_instance import held_in
 from trade_gateway.terminal._output import Output, complain
 
@@ -166,7 +166,7 @@ def _about(file: Path) -> Manifest:
     return Manifest(format=1, version=version("trade-gateway"), host=here, made_at=now, file=name, files=[])
 
 
-def _config(named: Named, staging: Path) -> Iterator[Source]:
+def _config(named: NamedFiles, staging: Path) -> Iterator[Source]:
     """Returns the file and those that it names. Raises ConfigurationError if one is missing or elsewhere."""
     folder = named.files[0].parent
     for one in named.files:
@@ -179,7 +179,7 @@ def _config(named: Named, staging: Path) -> Iterator[Source]:
             raise ConfigurationError(where=str(one), problem="is named, but does not exist") from None
 
 
-def _states(named: Named, folder: Path, staging: Path) -> Iterator[Source]:
+def _states(named: NamedFiles, folder: Path, staging: Path) -> Iterator[Source]:
     """Returns the state of its systems, without logs."""
     for system in named.systems:
         for path in sorted((folder / system).rglob("*")):

@@ -16,7 +16,7 @@ _LOCAL: Final = "local"
 _Table = TypeVar("_Table", bound=Struct)
 
 
-class Named(NamedTuple):
+class NamedFiles(NamedTuple):
     """The named files and folders as absolute paths; they need not exist."""
 
     files: tuple[Path, ...]
@@ -84,7 +84,7 @@ class _Policy(Struct):
     revoked_file: str = ""
 
 
-def named_files(path: Path) -> Named:
+def named_files(path: Path) -> NamedFiles:
     """Reads a gateway file or a system file, and the files that it names.
 
     Raises:
@@ -106,16 +106,16 @@ def named_files(path: Path) -> Named:
             robots += inner.robots
             records += inner.records
             systems += inner.systems
-    return Named(_once(files), _once(robots), _once(records), tuple(dict.fromkeys(systems)), len(containers))
+    return NamedFiles(_once(files), _once(robots), _once(records), tuple(dict.fromkeys(systems)), len(containers))
 
 
 def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(Path(os.path.normpath(path)) for path in paths))
 
 
-def _read(path: Path, kind: type[_Table]) -> _Table:
+def _read(path: Path, table_type: type[_Table]) -> _Table:
     _, raw = read_toml(path)
     try:
-        return msgspec.convert(raw, kind)
+        return msgspec.convert(raw, table_type)
     except msgspec.ValidationError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None

@@ -18,7 +18,7 @@ from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway._usage import UsageError
-from trade_gateway.cli.operation._file_closure import Named, named_files
+from trade_gateway.cli.operation._file_closure import NamedFiles, named_files
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, hidden_in, needs_of, program_folders, unit_text
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.terminal._output import Output
@@ -79,7 +79,7 @@ def _require_there(file: Path, root: Path) -> None:
         raise UsageError(where=str(file), problem=f"does not exist on this computer; did you mean {there}?")
 
 
-def _doubts(named: Named, user: str, root: Path) -> Iterable[str]:
+def _doubts(named: NamedFiles, user: str, root: Path) -> Iterable[str]:
     """Returns warnings about files that the service may not find, or not permanently."""
     for what, path in (("the Python", Path(sys.executable)), *(("file", one) for one in named.files)):
         seen = _seen(path, root)
@@ -123,7 +123,7 @@ def _seen(path: Path, root: Path) -> Path:
     return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
 
 
-def _unit(named: Named, user: str, root: Path) -> str:
+def _unit(named: NamedFiles, user: str, root: Path) -> str:
     def seen(path: Path) -> Path:
         return _seen(path, root)
 

@@ -18,7 +18,7 @@ _LEAVES_S: Final = 35
 """How long the gateway and each container may take to shut down, in seconds: to stop a robot and save states."""
 
 
-class Needs(Struct, frozen=True):
+class HostResources(Struct, frozen=True):
     """The resources of the host that a gateway and its robots need."""
 
     serial: bool = False
@@ -31,7 +31,7 @@ class Needs(Struct, frozen=True):
     """Whether drivers run in real time."""
 
 
-def needs_of(robots: Iterable[Robot]) -> Needs:
+def needs_of(robots: Iterable[Robot]) -> HostResources:
     """Returns the needs of robot files. Options of cameras and sensors that begin with ``/dev/`` are devices."""
     ports, others, can, drives = set[str](), set[str](), False, False
     for robot in robots:
@@ -53,7 +53,7 @@ def needs_of(robots: Iterable[Robot]) -> Needs:
     # An adapter may get another number when it is plugged in again, so its whole kind is allowed.
     kinds = ("char-ttyUSB", "char-ttyACM") if ports else ()
     fixed = {port for port in ports if not _COMES_AND_GOES.match(port)}
-    return Needs(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can, real_time=drives)
+    return HostResources(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can, real_time=drives)
 
 
 def program_folders() -> list[Path]:
@@ -65,7 +65,7 @@ def unit_text(
     gateway: Path,
     *,
     user: str,
-    needs: Needs,
+    needs: HostResources,
     containers: int,
     program: Sequence[str],
     folders: Iterable[Path],
@@ -104,7 +104,7 @@ def unit_text(
     return re.sub(r"@([A-Z]+)@", lambda found: parts[found.group(1)], _UNIT)
 
 
-def _devices(needs: Needs) -> str:
+def _devices(needs: HostResources) -> str:
     if not needs.devices:
         return "PrivateDevices=yes"
     group = ["SupplementaryGroups=dialout"] if needs.serial else []

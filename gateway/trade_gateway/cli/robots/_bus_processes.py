@@ -106,7 +106,7 @@ class BusProcesses:
 
 def _child(container: Container, robot: Robot, bus: str, ports: Mapping[str, str], options: Sequence[str]) -> "Child":
     from trade_gateway.config._children import Child, Supervised  # noqa: PLC0415 - see above
-    from trade_gateway.config._entry import ContainerSpec, Entry  # noqa: PLC0415 - see above
+    from trade_gateway.config._entry import ContainerSpec, ContainerTable  # noqa: PLC0415 - see above
 
     settings = container.settings
     name, file = f"{container.name}-{bus}", str(Path(robot.where).absolute())
@@ -119,4 +119,4 @@ def _child(container: Container, robot: Robot, bus: str, ports: Mapping[str, str
     environment = {key: value for key, value in os.environ.items() if key not in _ONE_PROCESS_ONLY}
     named = {"TRADE_TLS": settings.tls, "TRADE_POLICY": settings.policy}
     environment.update({key: str(place) for key, place in named.items() if place is not None})
-    return Child(ContainerSpec(name, Entry(robot=file), words, {}), Supervised(), environment)
+    return Child(ContainerSpec(name, ContainerTable(robot=file), words, {}), Supervised(), environment)

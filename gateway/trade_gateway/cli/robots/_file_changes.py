@@ -19,7 +19,7 @@ def digest(path: Path) -> str:
     return _digest([path, *_beside(path)])
 
 
-class Named(NamedTuple):
+class FileDigests(NamedTuple):
     """The files that a gateway file names, at one moment."""
 
     digests: Mapping[Path, str]
@@ -27,7 +27,7 @@ class Named(NamedTuple):
     policy: Policy | None
     """The gateway's own policy."""
 
-    def since(self, before: "Named") -> str:
+    def since(self, before: "FileDigests") -> str:
         """Describes the changes in words; empty if there are none."""
         changed = [path for path, seen in self.digests.items() if before.digests.get(path) != seen]
         changes = [_certified(path) for path in changed if path.name == _CERTIFICATE]
@@ -37,10 +37,12 @@ class Named(NamedTuple):
         return ", ".join(changes)
 
 
-def named_by(path: Path, plan: Plan) -> Named:
+def named_by(path: Path, plan: Plan) -> FileDigests:
     """Reads what a gateway file names now. Raises ConfigurationError if its policy has an error."""
     policy = plan.settings.policy
-    return Named({file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy))
+    return FileDigests(
+        {file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy)
+    )
 
 
 def _certified(path: Path) -> str:

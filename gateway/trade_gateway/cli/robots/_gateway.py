@@ -13,12 +13,12 @@ from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
 from trade_gateway.cli.robots._child_news import say_news
-from trade_gateway.cli.robots._file_changes import Named, digest, named_by
+from trade_gateway.cli.robots._file_changes import FileDigests, digest, named_by
 from trade_gateway.cli.robots._hub import allow_many_links
 from trade_gateway.config._gateway_file import Plan, read_gateway_file
 from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
-from trade_gateway.sharing._guests import Guests, opened
+from trade_gateway.sharing._guests import SystemGuests, opened
 from trade_gateway.supervisor import ChildServices, News, Supervisor
 from trade_gateway.supervisor._described import described
 from trade_gateway.terminal._detached import Detach, detach_now, ready
@@ -92,14 +92,14 @@ def gateway(
 class Gateway:
     """The gateway's container, its guests in other systems and its children, as the file says now."""
 
-    def __init__(self, file: Path, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
+    def __init__(self, file: Path, plan: Plan, named: FileDigests, leave: Callable[[], None]) -> None:
         self._file = file
         self._plan = plan
         self._leave = leave
         """Ends the gateway when its container is terminated."""
         self._named = named
         """The contents of the files that the gateway file names."""
-        self._guests = Guests()
+        self._guests = SystemGuests()
         self._container = Container(plan.settings, on_terminate=leave)
         self._running: Settings | None = plan.settings
         """The settings of the open container."""

@@ -24,7 +24,7 @@ class State(str, Enum):
     EVENTS = "events"
 
 
-class _Shown(NamedTuple):
+class _StateView(NamedTuple):
     """How a state is asked for and shown."""
 
     service: str
@@ -33,7 +33,7 @@ class _Shown(NamedTuple):
     nothing: str
 
 
-class _Linked(Struct, frozen=True):
+class _ReportedLink(Struct, frozen=True):
     """A link, and the container that reports it."""
 
     container: str
@@ -65,7 +65,7 @@ def say_state(out: Output, container: Container, state: State) -> None:
     shown, found = _STATES[state], list[Any]()
     for answer in _ask_each(container, shown.service):
         if state is State.LINKS:
-            found += [_Linked(answer.container, link) for link in answer.links if link.to != container.name]
+            found += [_ReportedLink(answer.container, link) for link in answer.links if link.to != container.name]
         elif state is State.EVENTS:
             found += [event for event in answer if event.about != container.name]
         else:
@@ -80,7 +80,7 @@ def say_state(out: Output, container: Container, state: State) -> None:
         out.say(shown.nothing)
 
 
-def _link(linked: _Linked) -> Row:
+def _link(linked: _ReportedLink) -> Row:
     info = linked.link
     kind = f"{info.to or '?'}{' (bridge)' if info.bridge else ''}"
     way = "to" if info.dialled else "from"
@@ -114,25 +114,25 @@ def _list(texts: Sequence[str]) -> str:
 
 
 _STATES: Final = {
-    State.LINKS: _Shown(
+    State.LINKS: _StateView(
         "network",
         ("CONTAINER", "LINKED WITH", "FOR", "CALLS", "DIALLED", "AT", "IDENTITY", "FROM"),
         _link,
         "no container is linked with another one",
     ),
-    State.NETWORK: _Shown(
+    State.NETWORK: _StateView(
         "network",
         ("CONTAINER", "DISCOVERY", "BROADCAST", "LISTENS", "DIALS", "CERTIFICATE ENDS", "BRIDGE"),
         _network,
         "no container reports how it is reached",
     ),
-    State.LISTENERS: _Shown(
+    State.LISTENERS: _StateView(
         "stream_listeners",
         ("SERVICE", "LISTENER", "RATE", "UNTIL", "CONTAINER"),
         _listener,
         "no service is listened to",
     ),
-    State.EVENTS: _Shown(
+    State.EVENTS: _StateView(
         "state_events",
         ("TIME", "CONTAINER", "EVENT", "ABOUT", "DETAILS"),
         _event,

@@ -38,7 +38,7 @@ app = typer.Typer(
 )
 
 
-class Entry(NamedTuple):
+class ContainerAuditRow(NamedTuple):
     """A row of the audit record of a container."""
 
     container: str
@@ -157,7 +157,7 @@ def _records(folder: Path, *, missing_is_wrong: bool = True) -> list[Path]:
     return found
 
 
-def _rows(path: Path, seen: dict[Path, int]) -> Iterator[Entry]:
+def _rows(path: Path, seen: dict[Path, int]) -> Iterator[ContainerAuditRow]:
     """Returns the rows that were not seen yet."""
     try:
         with reading(path, seen.get(path, 0)) as (end, links):
@@ -165,7 +165,7 @@ def _rows(path: Path, seen: dict[Path, int]) -> Iterator[Entry]:
                 seen[path] = 0
             for link in links:
                 seen[path] = link.row.seq
-                yield Entry(path.stem, link.row)
+                yield ContainerAuditRow(path.stem, link.row)
     except (sqlite3.Error, msgspec.ValidationError) as bad:
         complain(f"{path} cannot be read: {bad}")
 
@@ -178,7 +178,7 @@ def _verified(path: Path, noted: Mapping[int, bytes]) -> ChainCheck:
         return ChainCheck(broken_at=1, problem=f"it cannot be read: {bad}")
 
 
-class _Noted(msgspec.Struct):
+class _NotedHead(msgspec.Struct):
     container: str
     seq: int
     hash: str
@@ -189,7 +189,7 @@ def _noted(file: Path) -> dict[str, dict[int, bytes]]:
     found: dict[str, dict[int, bytes]] = {}
     try:
         for line in file.read_bytes().splitlines():
-            noted = msgspec.json.decode(line, type=_Noted)
+            noted = msgspec.json.decode(line, type=_NotedHead)
             found.setdefault(noted.container, {})[noted.seq] = bytes.fromhex(noted.hash)
     except (OSError, ValueError, RecursionError) as bad:
         raise UsageError(where=f"--against {file}", problem=str(bad)) from None
@@ -211,7 +211,7 @@ def _moment(since: str) -> int:
 # --- output
 
 
-def _say(out: Output, entry: Entry) -> None:
+def _say(out: Output, entry: ContainerAuditRow) -> None:
     row = entry.row
     if out.as_json:
         out.data({"container": entry.container, **msgspec.structs.asdict(row)})

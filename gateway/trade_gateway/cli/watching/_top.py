@@ -25,7 +25,7 @@ from trade_gateway.terminal._system_choice import visitor
 _ANSWERS_WITHIN_S: Final = 1.0
 
 
-class Unwell(Struct, frozen=True):
+class UnhealthyProvider(Struct, frozen=True):
     """A provider that is not healthy."""
 
     group: str
@@ -43,7 +43,7 @@ class Locked(Struct, frozen=True):
     waiting: tuple[str, ...]
 
 
-class Shown(Struct, frozen=True):
+class SystemSnapshot(Struct, frozen=True):
     """A snapshot of a system; with ``--json`` one line."""
 
     at: float
@@ -53,7 +53,7 @@ class Shown(Struct, frozen=True):
     """The containers, the busiest first."""
     silent: Sequence[str]
     """Containers that did not answer within 1 s."""
-    unwell: Sequence[Unwell]
+    unwell: Sequence[UnhealthyProvider]
     locks: Sequence[Locked]
     estops: Sequence[str]
     """The open e-stops, each with its giver and reason."""
@@ -80,11 +80,11 @@ def top(
             looks += 1
 
 
-def look(container: Container) -> Shown:
+def look(container: Container) -> SystemSnapshot:
     """Takes a snapshot of the system, as this container sees it."""
     loads, silent = _ask(container)
     services = container.services(~where(group="trade") & ~where.local)
-    return Shown(
+    return SystemSnapshot(
         at=time.time(),
         system=container.settings.system,
         services=len(services),
@@ -106,9 +106,9 @@ def _ask(container: Container) -> tuple[list[LoadInfo], list[str]]:
     return [outcome.result for outcome in outcomes if outcome.ok], sorted(silent)
 
 
-def _unwell(services: Sequence[Handle]) -> list[Unwell]:
+def _unwell(services: Sequence[Handle]) -> list[UnhealthyProvider]:
     found = {
-        Unwell(handle.groups[0] if handle.groups else handle.label, handle.container, handle.health)
+        UnhealthyProvider(handle.groups[0] if handle.groups else handle.label, handle.container, handle.health)
         for handle in services
         if handle.health != HEALTHY
     }
@@ -116,13 +116,13 @@ def _unwell(services: Sequence[Handle]) -> list[Unwell]:
 
 
 @contextmanager
-def _screen(out: Output) -> Generator[Callable[[Shown], None]]:
+def _screen(out: Output) -> Generator[Callable[[SystemSnapshot], None]]:
     if out.as_json or not sys.stdout.isatty():
         yield out.data if out.as_json else lambda shown: out.say("\n".join(_lines(shown, None)) + "\n")
         return
     with Live(console=Console(highlight=False), screen=True, auto_refresh=False) as live:
 
-        def show(shown: Shown) -> None:
+        def show(shown: SystemSnapshot) -> None:
             width, height = shutil.get_terminal_size()
             lines = [Text(line, no_wrap=True) for line in _lines(shown, width)[: height - 1]]
             lines[0].stylize("bold red" if shown.estops else "bold")
@@ -131,7 +131,7 @@ def _screen(out: Output) -> Generator[Callable[[Shown], None]]:
         yield show
 
 
-def _lines(shown: Shown, width: int | None) -> list[str]:
+def _lines(shown: SystemSnapshot, width: int | None) -> list[str]:
     """Returns the lines of the whole screen."""
     counts = [f"{len(shown.containers) + len(shown.silent)} containers", f"{shown.services} services"]
     counts += [f"{len(items)} {word}" for items, word in ((shown.unwell, "not well"), (shown.locks, "locked")) if items]

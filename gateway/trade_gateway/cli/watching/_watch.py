@@ -46,7 +46,7 @@ class Event(Struct, frozen=True):
     """The problem, the lock's owner and purpose, or the e-stop's giver and reason."""
 
 
-class _Kind(NamedTuple):
+class _EventKind(NamedTuple):
     """Events of one kind, which share a line."""
 
     what: What
@@ -71,7 +71,7 @@ def watch(
         meant = meant & ~where(group="trade")
     out = Output(as_json=as_json)
     with visitor(context) as container:
-        seen = Watched(container, meant)
+        seen = WatchedSystem(container, meant)
         out.say(f"watching {seen.services} services in system {escape(container.settings.system)}; Ctrl-C ends")
         pause = threading.Event()
         while True:
@@ -79,7 +79,7 @@ def watch(
             pause.wait(_EVERY_S)
 
 
-class Watched:
+class WatchedSystem:
     """The known state of a system, and its changes."""
 
     def __init__(self, container: Container, meant: Constraint) -> None:
@@ -156,11 +156,11 @@ def _of_estop(at: float, what: What, known: Estop) -> Event:
 
 
 def _say(out: Output, news: Iterable[Event]) -> None:
-    kinds: dict[_Kind, list[Event]] = {}
+    kinds: dict[_EventKind, list[Event]] = {}
     for one in news:
         if out.as_json:
             out.data(one)
-        kinds.setdefault(_Kind(one.what, one.container, one.text), []).append(one)
+        kinds.setdefault(_EventKind(one.what, one.container, one.text), []).append(one)
     for kind, alike in kinds.items():
         colour = _COLOURS.get(kind.what, "bold")
         about = escape(_some([one.about for one in alike]))

@@ -20,7 +20,7 @@ PLACE: Final = 3
 _DATASET: Final = "LeRobot dataset"
 
 
-class Form(str, Enum):
+class ExportFormat(str, Enum):
     """What a recording becomes."""
 
     LEROBOT = "lerobot"
@@ -34,7 +34,7 @@ class Names(str, Enum):
     FULL = "full"
 
 
-class Cut(str, Enum):
+class EpisodeBoundary(str, Enum):
     """How a recording is cut into episodes."""
 
     WHOLE = "whole"
@@ -45,7 +45,9 @@ def export(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A recording.")],
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty folder for the dataset or the bag.")],
-    form: Annotated[Form, typer.Option("--as", help="lerobot: a dataset; ros2: a bag in MCAP.")] = Form.LEROBOT,
+    form: Annotated[
+        ExportFormat, typer.Option("--as", help="lerobot: a dataset; ros2: a bag in MCAP.")
+    ] = ExportFormat.LEROBOT,
     group: Annotated[
         list[str] | None, typer.Option(help="Export only these joints, arm or gripper. Repeatable. Default: all.")
     ] = None,
@@ -53,11 +55,11 @@ def export(
         int, typer.Option(rich_help_panel=_DATASET, min=1, max=1000, metavar="HZ", help="Frame rate, in Hz.")
     ] = 30,
     cut: Annotated[
-        Cut,
+        EpisodeBoundary,
         typer.Option(
             "--episodes", rich_help_panel=_DATASET, help="whole: one episode; locks: one per lock of the joints."
         ),
-    ] = Cut.WHOLE,
+    ] = EpisodeBoundary.WHOLE,
     task: Annotated[
         str | None,
         typer.Option(
@@ -79,17 +81,17 @@ def export(
     """
     _refuse_others(context, form)
     out = Output(as_json=as_json)
-    if form is Form.ROS2:
+    if form is ExportFormat.ROS2:
         _export_bag(out, file, folder, group, names)
     else:
         _export_dataset(out, file, folder, group, fps, cut, task)
 
 
-_ONLY: Final = {Form.LEROBOT: ("fps", "cut", "task"), Form.ROS2: ("names",)}
+_ONLY: Final = {ExportFormat.LEROBOT: ("fps", "cut", "task"), ExportFormat.ROS2: ("names",)}
 """Options that only one form has."""
 
 
-def _refuse_others(context: typer.Context, form: Form) -> None:
+def _refuse_others(context: typer.Context, form: ExportFormat) -> None:
     options = {option.name: option.opts[0] for option in context.command.params}
     for other, names in _ONLY.items():
         for name in names if other is not form else ():
@@ -130,7 +132,7 @@ def _export_bag(out: Output, file: Path, folder: Path, asked: list[str] | None, 
 
 
 def _export_dataset(
-    out: Output, file: Path, folder: Path, asked: list[str] | None, fps: int, cut: Cut, task: str | None
+    out: Output, file: Path, folder: Path, asked: list[str] | None, fps: int, cut: EpisodeBoundary, task: str | None
 ) -> None:
     require("mcap", "export")
     require("pyarrow", "export")
@@ -145,7 +147,7 @@ def _export_dataset(
     groups = _groups(file, asked, found)
     states = {name: found[name] for name in groups}
     joints = [joint for measured in states.values() for joint in measured[0].names]
-    spans = locked(entries(file), joints) if cut is Cut.LOCKS else [Span(file.stem)]
+    spans = locked(entries(file), joints) if cut is EpisodeBoundary.LOCKS else [Span(file.stem)]
     if task is not None:
         spans = [span._replace(task=task) for span in spans]
     made = list(episodes(states, spans, fps, lambda span, what: complain(f"{span.task} {what}")))

@@ -10,7 +10,7 @@ from trade_gateway.process._addresses import is_loopback
 from trade_gateway.process._signals import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._recorder import Recorder
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 from trade_gateway.terminal import sections
 from trade_gateway.terminal._options import Groups, Json, Readers
 from trade_gateway.terminal._output import Output, complain
@@ -44,7 +44,7 @@ def foxglove(
     require("foxglove", "foxglove")
     from trade_gateway.recording._live import Live  # noqa: PLC0415 - loads what the other commands do not need
 
-    out, wanted = Output(as_json=as_json), Wanted(group or [], services or [])
+    out, wanted = Output(as_json=as_json), RecordedParts(group or [], services or [])
     with (
         leaving() as ending,
         visitor(context) as container,
@@ -67,7 +67,7 @@ class _Progress:
     """Output while the data is shown."""
 
     def __init__(self, out: Output, live: "Live", recorder: Recorder) -> None:
-        self._out = out
+        self._stream = out
         self._live = live
         self._recorder = recorder
         self._began = time.monotonic()
@@ -76,12 +76,12 @@ class _Progress:
     def begin(self) -> None:
         """Prints the address and the services that are shown."""
         services = self._recorder.look()
-        if self._out.as_json:
-            self._out.data({"url": self._live.url, "services": services})
+        if self._stream.as_json:
+            self._stream.data({"url": self._live.url, "services": services})
             return
         named = ", ".join(services) or "no service with joints or pictures yet"
-        self._out.say(f"[bold green]live[/] at {self._live.url}: {escape(named)}; Ctrl-C ends")
-        self._out.say("there is no login: every program and every open web page on this computer can view it")
+        self._stream.say(f"[bold green]live[/] at {self._live.url}: {escape(named)}; Ctrl-C ends")
+        self._stream.say("there is no login: every program and every open web page on this computer can view it")
 
     def beat(self) -> None:
         """Prints warnings, and one line per second for programs."""
@@ -91,15 +91,15 @@ class _Progress:
         if self._recorder.refused not in ("", self._refused):
             self._refused = self._recorder.refused
             complain(f"some data is not shown: {self._refused}")
-        if self._out.as_json:
-            self._out.data(self._sums())
+        if self._stream.as_json:
+            self._stream.data(self._sums())
 
     def end(self) -> None:
         """Prints the totals."""
         sums = self._sums()
-        if not self._out.as_json:
+        if not self._stream.as_json:
             lost = f", {sums['dropped']} samples lost before they arrived here" if sums["dropped"] else ""
-            self._out.say(f"[bold]shown[/]: {sums['messages']} messages in {sums['seconds']:.0f} s{lost}")
+            self._stream.say(f"[bold]shown[/]: {sums['messages']} messages in {sums['seconds']:.0f} s{lost}")
 
     def _sums(self) -> dict[str, float]:
         return {

@@ -76,42 +76,42 @@ class _Progress:
     """Output while a recording runs."""
 
     def __init__(self, out: Output) -> None:
-        self._out = out
+        self._stream = out
         self._began = time.monotonic()
         self._live = sys.stdout.isatty() and not out.as_json
 
     def begin(self, recorder: Recorder, where: Path) -> None:
         """Prints the recorded services and the destination."""
         services = recorder.look()
-        if self._out.as_json:
-            self._out.data({**ready(recorder.container), "recording": str(where), "services": services})
+        if self._stream.as_json:
+            self._stream.data({**ready(recorder.container), "recording": str(where), "services": services})
             return
         named = ", ".join(services) or "no service with joints or pictures yet"
-        self._out.say(f"[bold]recording[/] to {escape(str(where))}: {escape(named)}; Ctrl-C ends")
+        self._stream.say(f"[bold]recording[/] to {escape(str(where))}: {escape(named)}; Ctrl-C ends")
 
     def beat(self, recorder: Recorder, size_bytes: int) -> None:
         """Prints the progress: one line that is overwritten in a terminal, one line per second for programs."""
-        if self._out.as_json:
-            self._out.data(self._sums(recorder, size_bytes))
+        if self._stream.as_json:
+            self._stream.data(self._sums(recorder, size_bytes))
         elif self._live:
             print(f"\r{self._text(recorder, size_bytes)} ", end="", flush=True)  # noqa: T201 - Console ends lines
 
-    def saved(self, path: Path, why: str, messages: int) -> None:
+    def saved(self, path: Path, reason: str, messages: int) -> None:
         """Reports that a file of the last seconds was written."""
-        if self._out.as_json:
-            self._out.data({"saved": str(path), "why": why, "messages": messages})
+        if self._stream.as_json:
+            self._stream.data({"saved": str(path), "why": reason, "messages": messages})
         else:
-            self._out.say(f"[bold red]{escape(why)}[/]: saved {messages} messages to {escape(str(path))}")
+            self._stream.say(f"[bold red]{escape(reason)}[/]: saved {messages} messages to {escape(str(path))}")
 
     def end(self, recorder: Recorder, where: Path, size_bytes: int) -> None:
         """Prints the totals, and what was not recorded."""
         if recorder.refused:
             complain(f"some data was not recorded: {recorder.refused}")
-        if self._out.as_json:
-            self._out.data({"recorded": str(where), **self._sums(recorder, size_bytes)})
+        if self._stream.as_json:
+            self._stream.data({"recorded": str(where), **self._sums(recorder, size_bytes)})
             return
         line_end = "\n" if self._live else ""
-        self._out.say(f"{line_end}[bold]recorded[/] {escape(str(where))}: {self._text(recorder, size_bytes)}")
+        self._stream.say(f"{line_end}[bold]recorded[/] {escape(str(where))}: {self._text(recorder, size_bytes)}")
 
     def _sums(self, recorder: Recorder, size_bytes: int) -> dict[str, float]:
         seconds = round(time.monotonic() - self._began, 3)

@@ -9,7 +9,7 @@ import typer
 from trade_gateway._usage import UsageError
 from trade_gateway.process._signals import leaving, refuse_twice
 from trade_gateway.recording import require
-from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording._sources import RecordedParts
 from trade_gateway.terminal import sections
 from trade_gateway.terminal._options import TIMING, Groups, Json, Readers
 from trade_gateway.terminal._output import Output
@@ -80,7 +80,7 @@ def record(
     if (file is None) == (at_fault is None) or (at_fault is None) != (keep_last is None):
         problem = "needs a destination: OUT.mcap, or --keep-last 30 --at-fault FOLDER"
         raise UsageError(where="trade record", problem=problem)
-    wanted = Wanted(group or [], services or [], hz, camera_hz, service_hz)
+    wanted = RecordedParts(group or [], services or [], hz, camera_hz, service_hz)
     attachments = [_read(path) for path in attach or []]
     require("mcap", "record")
     from trade_gateway.recording.commands import _progress as room  # noqa: PLC0415 - loads what the other commands do not need

@@ -7,12 +7,12 @@ from trade_gateway.ros._file import FromAction
 from trade_gateway.ros._graph import Graph
 from trade_gateway.ros.from_ros._providers import Method, Records, plain, provider
 from trade_gateway.ros.from_ros._sent_goals import SentGoals
-from trade_gateway.ros.from_ros._services import Offered
+from trade_gateway.ros.from_ros._services import OfferedProvider
 
 _NO_PARAMETERS: Final[frozenset[str]] = frozenset()
 
 
-def action_from_ros(entry: FromAction, graph: Graph, records: Records) -> Offered:
+def action_from_ros(entry: FromAction, graph: Graph, records: Records) -> OfferedProvider:
     """``[[from_ros.action]]``. Raises ConfigurationError."""
     goal, result, feedback = graph.types.parts(entry.type)
     parameters, optional = records.parameters(goal)
@@ -32,4 +32,4 @@ def action_from_ros(entry: FromAction, graph: Graph, records: Records) -> Offere
     methods = [Method(name, doc, parameters, optional, returns, entry.effect, carry_out, "stop" if moves else None)]
     if moves:
         methods.append(Method("stop", f"Cancel the goals of {entry.action}.", {}, _NO_PARAMETERS, None, "stop", stop))
-    return Offered(f"action {entry.action}", entry.groups, provider("RosAction", methods, moves), lambda: None)
+    return OfferedProvider(f"action {entry.action}", entry.groups, provider("RosAction", methods, moves), lambda: None)

@@ -16,7 +16,7 @@ from trade_gateway.ros._file import FromJoints
 from trade_gateway.ros._goals import ACTION, goal_of
 from trade_gateway.ros._graph import Graph, RosUnreachable
 from trade_gateway.ros.from_ros._sent_goals import SentGoals
-from trade_gateway.ros.from_ros._services import Offered
+from trade_gateway.ros.from_ros._services import OfferedProvider
 from trade_gateway.ros_messages._types import Message
 
 _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
@@ -52,7 +52,7 @@ class RosJoints:
         self._entry = entry
         self._names = [f"{entry.groups[0]}.{name}" for name in entry.joints]
         self.resources: Final = tuple(Resource(name) for name in self._names)
-        self._heard: dict[str, tuple[float, float | None, float | None, float]] = {}
+        self._latest: dict[str, tuple[float, float | None, float | None, float]] = {}
         self._began = time.monotonic()
         self._news = threading.Condition()
         """Notified of each message."""
@@ -63,7 +63,7 @@ class RosJoints:
         now = time.monotonic()
         for number, name in enumerate(message["name"][: len(message["position"])]):
             values = [_nth(message[field], number) for field in ("velocity", "effort")]
-            self._heard[name] = (message["position"][number], values[0], values[1], now)
+            self._latest[name] = (message["position"][number], values[0], values[1], now)
         with self._news:
             self._news.notify_all()
 
@@ -77,7 +77,7 @@ class RosJoints:
         """The last state of every joint; RosUnreachable if one is too old."""
         now, joints = time.monotonic(), list[RosJoint]()
         for ros_name, own in zip(self._entry.joints, self._names, strict=True):
-            position, velocity, effort, at = self._heard.get(ros_name, (0.0, None, None, None))
+            position, velocity, effort, at = self._latest.get(ros_name, (0.0, None, None, None))
             silent_s = now - (self._began if at is None else at)
             if at is None or silent_s > self._entry.stale_after_s:
                 problem = f"no state of {ros_name} for {silent_s:.3g} s. Is the node that publishes it running?"
@@ -174,7 +174,7 @@ class RosJoints:
 
     def _unheard(self, since: float) -> list[str]:
         """Joints without a state since then."""
-        return [name for name in self._entry.joints if name not in self._heard or self._heard[name][3] <= since]
+        return [name for name in self._entry.joints if name not in self._latest or self._latest[name][3] <= since]
 
     def close(self) -> None:
         """Ends the subscription."""
@@ -185,7 +185,7 @@ def _nth(values: Sequence[float], number: int) -> float | None:
     return values[number] if number < len(values) else None
 
 
-def joints_from_ros(entry: FromJoints, graph: Graph) -> Offered:
+def joints_from_ros(entry: FromJoints, graph: Graph) -> OfferedProvider:
     """``[[from_ros.joints]]``. Raises ConfigurationError."""
     made = RosJoints(entry, graph)
-    return Offered(f"action {entry.action}", entry.groups, made, made.close)
+    return OfferedProvider(f"action {entry.action}", entry.groups, made, made.close)

@@ -71,18 +71,18 @@ class Records:
 
     def __init__(self, types: Types) -> None:
         self._types = types
-        self._made: dict[str, type[msgspec.Struct]] = {}
+        self._structs: dict[str, type[msgspec.Struct]] = {}
 
     def of(self, type_name: str) -> type[msgspec.Struct]:
         """Returns the struct of a message type; its fields are optional, and zero by default."""
-        made = self._made.get(type_name)
+        made = self._structs.get(type_name)
         if made is None:
             fields = [self._field(field) for field in self._types.fields(type_name)]
             package, _, name = type_name.partition("/")
             made = msgspec.defstruct(
                 name.rpartition("/")[2], fields, kw_only=True, frozen=True, module=f"ros.{package}"
             )
-            self._made[type_name] = made
+            self._structs[type_name] = made
         return made
 
     def parameters(self, type_name: str) -> tuple[dict[str, Any], frozenset[str]]:

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from trade import Permit, Resource, current_call, permit
 from trade.errors import DeviceFault, MotionStopped
-from trade_gateway.ros._graph import Ended, Graph, Outcome, Pursuit, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import ActionGoal, GoalEnd, Graph, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros_messages._types import Message
 
 _STOPPED_WITHIN_S: Final = 1.8
@@ -36,7 +36,7 @@ class SentGoals:
         self._device = device
         self._resources: Final = tuple(resources)
         self._guard = threading.Condition()
-        self._active: Pursuit | None = None
+        self._active: ActionGoal | None = None
         self._sending = 0
         """Goals that are being sent to the action."""
         self._stops = 0
@@ -59,9 +59,9 @@ class SentGoals:
             if before is not None:  # our own: another move replaces it, and its caller waits for its end
                 before.cancel()
             outcome = self._ended(self._sent(goal, permitted, reported))
-        if outcome.how is Ended.CANCELED:
+        if outcome.how is GoalEnd.CANCELED:
             raise MotionStopped(device=self._device, reason=text_of(outcome) or "its goal was canceled")
-        if outcome.how is Ended.ABORTED:
+        if outcome.how is GoalEnd.ABORTED:
             raise self.fault(outcome)
         return outcome
 
@@ -89,7 +89,7 @@ class SentGoals:
                 fault = "a goal is being sent to it; it is canceled as soon as it has arrived"
                 raise DeviceFault(device=self._device, bus=self._action, fault=fault)
 
-    def _cancel(self, pursuit: Pursuit) -> None:
+    def _cancel(self, pursuit: ActionGoal) -> None:
         """Raises DeviceFault: its end was not confirmed, so it counts as moving."""
         pursuit.cancel()
         try:
@@ -100,7 +100,7 @@ class SentGoals:
             fault = f"canceled, but its end was not confirmed: {silent}"
             raise DeviceFault(device=self._device, bus=self._action, fault=fault) from None
 
-    def _sent(self, goal: Message, permitted: Permit, reported: Callable[[Message], Any]) -> Pursuit:
+    def _sent(self, goal: Message, permitted: Permit, reported: Callable[[Message], Any]) -> ActionGoal:
         """Sends a goal. A stop does not wait for this: it cancels the goal as soon as the goal has arrived."""
         call = current_call()
 
@@ -136,7 +136,7 @@ class SentGoals:
                     resource.moving = False
             self._guard.notify_all()
 
-    def _ended(self, pursuit: Pursuit) -> Outcome:
+    def _ended(self, pursuit: ActionGoal) -> Outcome:
         call = current_call()
         if call is not None:
             call.on_cancel(pursuit.cancel)
@@ -152,7 +152,7 @@ class SentGoals:
         self._rest(pursuit)
         return outcome
 
-    def _rest(self, pursuit: Pursuit) -> None:
+    def _rest(self, pursuit: ActionGoal) -> None:
         with self._guard:
             if self._active is pursuit:
                 self._active = None

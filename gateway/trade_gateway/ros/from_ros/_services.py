@@ -18,7 +18,7 @@ _STOP_AGAIN_S: Final = 0.2
 """Stop messages after ROS is back, for as long as nodes take to reconnect."""
 
 
-class Offered:
+class OfferedProvider:
     """Something of ROS that is offered in TRADE."""
 
     def __init__(self, where: str, groups: list[str], provider: object, close: Callable[[], object]) -> None:
@@ -28,7 +28,7 @@ class Offered:
         self.provider: Final = provider
         self._close = close
 
-    def offer(self, container: Container) -> "Offered":
+    def offer(self, container: Container) -> "OfferedProvider":
         """Registers it. Raises what `Container.register` does, and then leaves nothing behind."""
         try:
             container.register(self.provider, self.groups, meta={"ros": self.where})
@@ -43,7 +43,7 @@ class Offered:
         self._close()
 
 
-def service_from_ros(entry: FromService, graph: Graph, records: Records) -> Offered:
+def service_from_ros(entry: FromService, graph: Graph, records: Records) -> OfferedProvider:
     """``[[from_ros.service]]``. Raises ConfigurationError."""
     asked, answered = graph.types.parts(entry.type)
     parameters, optional = records.parameters(asked)
@@ -56,14 +56,14 @@ def service_from_ros(entry: FromService, graph: Graph, records: Records) -> Offe
 
     if entry.effect != "actuate":
         methods = [Method(name, doc, parameters, optional, returns, entry.effect, call)]
-        return Offered(f"service {entry.service}", entry.groups, provider("RosService", methods), _nothing)
+        return OfferedProvider(f"service {entry.service}", entry.groups, provider("RosService", methods), _nothing)
     motion = _Motion(entry, graph, Resource(f"{entry.groups[0]}.{name}"), call)
     methods = [
         Method(name, doc, parameters, optional, returns, "actuate", motion.begin, "stop"),
         Method("stop", f"{entry.stop} of ROS.", {}, frozenset(), None, "stop", motion.stop),
     ]
     made = provider("RosService", methods, [motion.resource])
-    return Offered(f"service {entry.service}", entry.groups, made, _nothing)
+    return OfferedProvider(f"service {entry.service}", entry.groups, made, _nothing)
 
 
 class _Motion:
@@ -116,7 +116,7 @@ class _Motion:
         self.resource.moving = False
 
 
-def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
+def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> OfferedProvider:
     """``[[from_ros.topic]]``: a message that is too old is an error. Raises ConfigurationError."""
     kind = records.of(entry.type)
     latest: list[tuple[Message, float]] = []
@@ -138,10 +138,10 @@ def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
     doc = f"The latest message of {entry.topic} in ROS ({entry.type}), {age}."
     made = provider("RosTopic", [Method(name, doc, {}, frozenset(), kind, "read", read)])
     subscription = graph.subscribe(entry.topic, entry.type, heard, latched=entry.latched)
-    return Offered(f"topic {entry.topic}", entry.groups, made, subscription.close)
+    return OfferedProvider(f"topic {entry.topic}", entry.groups, made, subscription.close)
 
 
-def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Offered:
+def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> OfferedProvider:
     """``[[from_ros.publish]]``. Raises ConfigurationError."""
     parameters, optional = records.parameters(entry.type)
     graph.types.to_bytes(entry.type, entry.stop or {})  # raises now, not when the stop is needed
@@ -154,7 +154,7 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
 
     if entry.stop is None:
         methods = [Method(name, doc, parameters, optional, None, "note", send)]
-        return Offered(f"topic {entry.topic}", entry.groups, provider("RosPublisher", methods), publisher.close)
+        return OfferedProvider(f"topic {entry.topic}", entry.groups, provider("RosPublisher", methods), publisher.close)
     setpoint = _SetPoint(Resource(f"{entry.groups[0]}.{name}"), publisher.send, entry, graph)
     holds = f" It holds for {entry.valid_s:g} s." if entry.valid_s else ""
     methods = [
@@ -167,7 +167,7 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
         setpoint.close()
         publisher.close()
 
-    return Offered(f"topic {entry.topic}", entry.groups, made, close)
+    return OfferedProvider(f"topic {entry.topic}", entry.groups, made, close)
 
 
 class _SetPoint:
@@ -241,7 +241,7 @@ class _SetPoint:
             self._still()
 
 
-def parameters_from_ros(entry: FromParameters, graph: Graph) -> Offered:
+def parameters_from_ros(entry: FromParameters, graph: Graph) -> OfferedProvider:
     """``[[from_ros.parameters]]``. Raises ConfigurationError."""
 
     def read(_: dict[str, Any]) -> dict[str, Any]:
@@ -255,7 +255,7 @@ def parameters_from_ros(entry: FromParameters, graph: Graph) -> Offered:
         kinds = {"name": str, "value": Any}
         doc = f"Set a parameter of {entry.node} in ROS."
         methods.append(Method("set_parameter", doc, kinds, frozenset(), None, "actuate", write))
-    return Offered(f"parameters of {entry.node}", entry.groups, provider("RosParameters", methods), _nothing)
+    return OfferedProvider(f"parameters of {entry.node}", entry.groups, provider("RosParameters", methods), _nothing)
 
 
 def _left_s(longest_s: float) -> float:

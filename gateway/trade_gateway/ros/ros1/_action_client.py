@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import GoalEnd, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1._status import ENDED, Status, now
 from trade_gateway.ros.ros1._topics import Topics
 from trade_gateway.ros.ros1._wire import action_types
@@ -41,15 +41,15 @@ _QUEUE: Final = 100
 _NOT_CANCELED: Final = frozenset({Status.PENDING, Status.ACTIVE})
 """States of a goal whose server has not received a cancel."""
 _HOW: Final = {
-    Status.SUCCEEDED: Ended.SUCCEEDED,
-    Status.PREEMPTED: Ended.CANCELED,
-    Status.RECALLED: Ended.CANCELED,
-    Status.ABORTED: Ended.ABORTED,
+    Status.SUCCEEDED: GoalEnd.SUCCEEDED,
+    Status.PREEMPTED: GoalEnd.CANCELED,
+    Status.RECALLED: GoalEnd.CANCELED,
+    Status.ABORTED: GoalEnd.ABORTED,
 }
 
 
 class _Goal:
-    """A goal that this client sent. See `Pursuit`."""
+    """A goal that this client sent. See `ActionGoal`."""
 
     def __init__(self, client: "ActionClient", number: str, feedback: Callable[[Message], object] | None) -> None:
         self._client = client
@@ -201,7 +201,7 @@ class ActionClient:
             if goal.server == name:
                 goal.give_up(f"its server {name} is gone")
 
-    def _status(self, message: Message, who: str, at: float) -> None:
+    def _status(self, message: Message, sender: str, at: float) -> None:
         states = {one["goal_id"]["id"]: Status(one["status"]) for one in message["status_list"]}
         for number, state in states.items():
             if state in _NOT_CANCELED:
@@ -210,7 +210,7 @@ class ActionClient:
                 with self._lock:
                     self._unwanted.pop(number, None)
         for number, goal in list(self._goals.items()):
-            if goal.server == who:
+            if goal.server == sender:
                 self._judge(goal, states.get(number), at)
 
     def _judge(self, goal: _Goal, state: Status | None, at: float) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, Refuse
 from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
 from trade_gateway.ros.ros1._topics import Topics
 from trade_gateway.ros.ros1._wire import action_types
@@ -27,9 +27,9 @@ _QUEUE: Final = 100
 _MOST: Final = 100
 """Number of goals whose state is published."""
 _HOW: Final = {
-    Ended.SUCCEEDED: Status.SUCCEEDED,
-    Ended.CANCELED: Status.PREEMPTED,
-    Ended.ABORTED: Status.ABORTED,
+    GoalEnd.SUCCEEDED: Status.SUCCEEDED,
+    GoalEnd.CANCELED: Status.PREEMPTED,
+    GoalEnd.ABORTED: Status.ABORTED,
 }
 _NEVER: Final[Time] = {"sec": 0, "nanosec": 0}
 _log: Final = logging.getLogger("trade.ros1")
@@ -131,11 +131,11 @@ class ActionServer:
 
     # --- arrival
 
-    def _goal_came(self, message: Message, who: str, at: float) -> None:
+    def _goal_came(self, message: Message, sender: str, at: float) -> None:
         number = message["goal_id"]["id"] or f"{self._node}-{next(self._numbers)}-{time.time():.9f}"
         sent = _of(message["goal_id"]["stamp"])
         goal_id: Message = {"id": number, "stamp": day(at) if sent == (0, 0) else message["goal_id"]["stamp"]}
-        taken = _ServedGoal(self, goal_id, message["goal"], who, at)
+        taken = _ServedGoal(self, goal_id, message["goal"], sender, at)
         refused = None if self._refuse is None else self._refuse(taken.message)
         with self.lock:
             if number in self._goals or self._closed.is_set():

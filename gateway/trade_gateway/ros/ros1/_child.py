@@ -97,7 +97,7 @@ class Child:
             words.start()
             own_end.settimeout(_START_S)
             channel = Channel(own_end, "trade-ros1")
-            signs = _Signs(own_end, heard)
+            signs = _SignsOfLife(own_end, heard)
             stood_still = ""
             with self._lock:
                 self._channel = channel
@@ -137,14 +137,14 @@ class Child:
                     _log.info("node of ROS 1: %s", text)
 
 
-class _Signs:
+class _SignsOfLife:
     """The signs of life among the frames."""
 
     def __init__(self, sock: socket.socket, on_frame: Callable[[Head, bytes], object]) -> None:
         self._sock = sock
         self._on_frame = on_frame
         self._patience_s = _START_S
-        self._at = time.monotonic()
+        self._last_at_s = time.monotonic()
 
     def heard(self, head: Head, body: bytes) -> None:
         if head["op"] == "alive":
@@ -152,12 +152,12 @@ class _Signs:
             self._sock.settimeout(_SILENT_S)
         else:
             self._on_frame(head, body)
-        self._at = time.monotonic()
+        self._last_at_s = time.monotonic()
 
     @property
     def missing(self) -> str:
         """Empty, or for how long there was no sign of life."""
-        late = time.monotonic() - self._at >= self._patience_s
+        late = time.monotonic() - self._last_at_s >= self._patience_s
         return f"froze: it sent nothing for {self._patience_s:g} s" if late else ""
 
 

@@ -65,7 +65,7 @@ class Link:
         self._state = threading.Condition()
         self._channel: Channel | None = None
         self._open: dict[int, Opened] = {}
-        self._asked: dict[int, Future[_Answer]] = {}
+        self._pending_answers: dict[int, Future[_Answer]] = {}
         self._turns = threading.BoundedSemaphore(_AT_ONCE)
         self._closed = False
         self._problem: str | None = None
@@ -121,41 +121,41 @@ class Link:
 
     # --- requests
 
-    def ask(self, what: str, head: Head, body: bytes, timeout_s: float, *, stops: bool = False) -> tuple[Any, bytes]:
+    def ask(self, request: str, head: Head, body: bytes, timeout_s: float, *, stops: bool = False) -> tuple[Any, bytes]:
         """Sends a request to the node; one that stops something does not wait for its turn.
 
         Raises:
-            RosUnreachable, RosRefused: about `what`.
+            RosUnreachable, RosRefused: about the `request`.
         """
         deadline = time.monotonic() + timeout_s
         if stops:
-            return self._answered(what, head, body, timeout_s, deadline)
+            return self._answered(request, head, body, timeout_s, deadline)
         if not self._turns.acquire(timeout=max(timeout_s, 0)):
-            raise RosUnreachable(what=what, problem=f"{_AT_ONCE} other requests are pending without an answer")
+            raise RosUnreachable(what=request, problem=f"{_AT_ONCE} other requests are pending without an answer")
         try:
-            return self._answered(what, head, body, timeout_s, deadline)
+            return self._answered(request, head, body, timeout_s, deadline)
         finally:
             self._turns.release()
 
-    def _answered(self, what: str, head: Head, body: bytes, timeout_s: float, deadline: float) -> tuple[Any, bytes]:
-        number, answered = self._ask(what, head, body, deadline)
+    def _answered(self, request: str, head: Head, body: bytes, timeout_s: float, deadline: float) -> tuple[Any, bytes]:
+        number, answered = self._ask(request, head, body, deadline)
         try:
             answer = answered.result(max(deadline - time.monotonic(), 0) + _MARGIN_S)
         except NotYet:
-            raise RosUnreachable(what=what, problem=f"no answer within {timeout_s:.3g} s") from None
+            raise RosUnreachable(what=request, problem=f"no answer within {timeout_s:.3g} s") from None
         finally:
             with self._state:
-                self._asked.pop(number, None)
-        return _judged(what, answer)
+                self._pending_answers.pop(number, None)
+        return _judged(request, answer)
 
-    def _ask(self, what: str, head: Head, body: bytes, deadline: float) -> tuple[int, "Future[_Answer]"]:
+    def _ask(self, request: str, head: Head, body: bytes, deadline: float) -> tuple[int, "Future[_Answer]"]:
         number = next(self._numbers)
         answered: Future[_Answer] = Future()
         with self._state:
             left_s = max(deadline - time.monotonic(), 0)
             if not self._state.wait_for(lambda: self._channel or self._closed, left_s) or self._closed:
-                raise RosUnreachable(what=what, problem=self.healthy)
-            self._asked[number] = answered
+                raise RosUnreachable(what=request, problem=self.healthy)
+            self._pending_answers[number] = answered
             left_s = max(deadline - time.monotonic(), 0.05)
             self._put({**head, "ask": number, "timeout_s": left_s}, body)
         return number, answered
@@ -186,8 +186,8 @@ class Link:
     def _on_end(self) -> None:
         with self._state:
             self._channel, self._problem = None, None
-            lost = list(self._asked.values())
-            self._asked.clear()
+            lost = list(self._pending_answers.values())
+            self._pending_answers.clear()
         for answered in lost:
             answered.set_result(_Answer({"failed": "unreachable", "problem": _GONE}, b""))
         self._alone()
@@ -200,7 +200,7 @@ class Link:
                 self._node_changed(head["name"], head["there"])
             case "answer":
                 with self._state:
-                    answered = self._asked.pop(head["ask"], None)
+                    answered = self._pending_answers.pop(head["ask"], None)
                 if answered is not None:
                     answered.set_result(_Answer(head, body))
             case _:
@@ -212,12 +212,12 @@ class Link:
                     self.reply(head["ask"], b"", "it is not offered any more")
 
 
-def _judged(what: str, answer: _Answer) -> tuple[Any, bytes]:
+def _judged(request: str, answer: _Answer) -> tuple[Any, bytes]:
     head, body = answer
     match head["failed"]:
         case "unreachable":
-            raise RosUnreachable(what=what, problem=head["problem"])
+            raise RosUnreachable(what=request, problem=head["problem"])
         case "refused":
-            raise RosRefused(what=what, problem=head["problem"])
+            raise RosRefused(what=request, problem=head["problem"])
         case _:
             return head["value"], body

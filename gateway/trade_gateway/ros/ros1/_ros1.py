@@ -10,15 +10,15 @@ from typing import Any, Final, cast
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import (
+    ActionGoal,
     Answer,
-    Closes,
+    Closable,
     Goal,
     Graph,
     Heard,
     NodeListener,
     Outcome,
     Publisher,
-    Pursuit,
     Refuse,
     RosRefused,
 )
@@ -119,7 +119,7 @@ class Ros1(Graph):
         self._nodes = Nodes()
         self._lock = threading.RLock()
         self._clients: dict[str, ActionClient] = {}
-        self._open: set[Closes] = set()
+        self._open: set[Closable] = set()
         self.node: Final = _name(node, "node")
         master = master or os.environ.get("ROS_MASTER_URI", "") or _MASTER
         self._link = Link(master=master, node=node, python=python, ip=ip, changed=self._node, alone=self._nodes.none)
@@ -142,9 +142,9 @@ class Ros1(Graph):
         head = self._topic("publish", topic, type_name)
         return PublishedTopic(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
-    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
-        def came(message: Message, who: str, _: float) -> None:
-            callback(message, who)
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closable:
+        def came(message: Message, sender: str, _: float) -> None:
+            callback(message, sender)
 
         return self._closing(self.hear(topic, type_name, came, most=_NEWEST, latched=latched)[1])
 
@@ -168,7 +168,7 @@ class Ros1(Graph):
 
     # --- services
 
-    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closable:
         head = {**service_head(self._types, type_name), "op": "serve", "name": _name(name, "service")}
         if self._link.names("serve", name):
             raise ConfigurationError(where=name, problem="is offered already by this node")
@@ -186,12 +186,12 @@ class Ros1(Graph):
 
     # --- actions
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closable:
         return self._closing((ActionServer(self, _name(name, "action"), type_name, do, refuse).close,))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
-    ) -> Pursuit:
+    ) -> ActionGoal:
         with self._lock:
             client = self._clients.get(name)
             if client is None or client.type_name != type_name:
@@ -215,7 +215,7 @@ class Ros1(Graph):
             raise RosRefused(what=at, problem=f"{value!r} cannot be a parameter of ROS")
         self._link.ask(at, {"op": "set_parameter", "name": at, "value": value}, b"", timeout_s)
 
-    def watch_nodes(self, listener: NodeListener) -> Closes:
+    def watch_nodes(self, listener: NodeListener) -> Closable:
         return self._closing((self._nodes.watch(listener),))
 
     def close(self) -> None:
@@ -243,7 +243,7 @@ class Ros1(Graph):
             for client in list(self._clients.values()):
                 client.gone(name)
 
-    def _closing(self, steps: tuple[Callable[[], object], ...]) -> Closes:
+    def _closing(self, steps: tuple[Callable[[], object], ...]) -> Closable:
         closing = _Closing((*steps, lambda: self._open.discard(closing)))
         with self._lock:
             self._open.add(closing)

@@ -9,7 +9,7 @@ A request to cancel names a goal, or a time up to which all were accepted, or ne
 from enum import IntEnum
 from typing import Any, Final
 
-from trade_gateway.ros._graph import Ended
+from trade_gateway.ros._graph import GoalEnd
 
 CANCEL: Final = "action_msgs/srv/CancelGoal"
 STATUS: Final = "action_msgs/msg/GoalStatusArray"
@@ -37,7 +37,7 @@ class Refusal(IntEnum):
     GOAL_TERMINATED = 3
 
 
-ENDS: Final = {Ended.SUCCEEDED: Status.SUCCEEDED, Ended.CANCELED: Status.CANCELED, Ended.ABORTED: Status.ABORTED}
+ENDS: Final = {GoalEnd.SUCCEEDED: Status.SUCCEEDED, GoalEnd.CANCELED: Status.CANCELED, GoalEnd.ABORTED: Status.ABORTED}
 
 
 def uuid(goal_id: bytes) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, Refuse
 from trade_gateway.ros.ros2._action import ANY, CANCEL, ENDS, STATUS, Refusal, Status, uuid
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Server, ServiceRequest
@@ -20,7 +20,7 @@ _END_S: Final = 5.0
 _log: Final = logging.getLogger("trade")
 
 
-class Pursued(Goal):
+class ReceivedGoal(Goal):
     """A goal that a client has sent."""
 
     def __init__(self, action: "Action", goal_id: bytes, message: Message, came_at: float) -> None:
@@ -98,7 +98,7 @@ class Action:
         self._do = do
         self._refuse = refuse
         self._lock = threading.Lock()
-        self._goals: dict[bytes, Pursued] = {}
+        self._goals: dict[bytes, ReceivedGoal] = {}
         self._closed = False
         start = f"{name}/_action"
         self.feedback: Final = Topic(node, f"{start}/feedback", f"{type_name}_FeedbackMessage", latched=False)
@@ -129,7 +129,7 @@ class Action:
         """S01: the goal can be canceled on arrival; only after that does this wait for the name of its sender."""
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
-        goal = Pursued(self, goal_id, request["goal"], asked.came_at)
+        goal = ReceivedGoal(self, goal_id, request["goal"], asked.came_at)
         refused = None if self._refuse is None else self._refuse(goal.message)
         with self._lock:
             taken = refused is None and not self._closed and goal_id not in self._goals
@@ -167,7 +167,7 @@ class Action:
 
     # --- execution
 
-    def _pursue(self, goal: Pursued, before: list[Pursued], request: ServiceRequest) -> None:
+    def _pursue(self, goal: ReceivedGoal, before: list[ReceivedGoal], request: ServiceRequest) -> None:
         with self._lock:
             goal.status = max(goal.status, Status.EXECUTING)
             for other in before:
@@ -178,12 +178,12 @@ class Action:
         self._tell_status()
         goal.of = request.who()
         try:
-            self._end(goal, Outcome(Ended.CANCELED, {}) if goal.canceled else self._do(goal))
+            self._end(goal, Outcome(GoalEnd.CANCELED, {}) if goal.canceled else self._do(goal))
         except Exception:  # noqa: BLE001 - its client receives the failure
             _log.exception("a goal of %s failed", self._name)
-            self._end(goal, Outcome(Ended.ABORTED, {}))
+            self._end(goal, Outcome(GoalEnd.ABORTED, {}))
 
-    def _end(self, goal: Pursued, outcome: Outcome) -> None:
+    def _end(self, goal: ReceivedGoal, outcome: Outcome) -> None:
         self._node.types.to_bytes(self._type_name + "_Result", outcome.result)  # raises here, not for each client
         with self._lock:
             goal.outcome, goal.status = outcome, ENDS[outcome.how]
@@ -195,7 +195,7 @@ class Action:
         for asked in waiting:
             asked.answer(_status_of(goal))
 
-    def _going(self) -> list[Pursued]:
+    def _going(self) -> list[ReceivedGoal]:
         return [goal for goal in self._goals.values() if goal.outcome is None]
 
     def _tell_status(self) -> None:
@@ -213,17 +213,17 @@ def _nanoseconds(at: Mapping[str, Any]) -> int:
     return at["sec"] * 1_000_000_000 + at["nanosec"]
 
 
-def _meant(goal: Pursued, goal_id: bytes, until_ns: int) -> bool:
+def _meant(goal: ReceivedGoal, goal_id: bytes, until_ns: int) -> bool:
     if goal.id == goal_id or (goal_id == ANY and not until_ns):
         return True
     return 0 < goal.stamp_ns <= until_ns
 
 
-def _refusal(goal_id: bytes, known: Pursued | None, ending: list[Pursued]) -> Refusal:
+def _refusal(goal_id: bytes, known: ReceivedGoal | None, ending: list[ReceivedGoal]) -> Refusal:
     if ending or goal_id == ANY:
         return Refusal.NONE
     return Refusal.UNKNOWN_GOAL if known is None else Refusal.GOAL_TERMINATED
 
 
-def _status_of(goal: Pursued) -> dict[str, Any]:
+def _status_of(goal: ReceivedGoal) -> dict[str, Any]:
     return {"status": goal.status, "result": {} if goal.outcome is None else goal.outcome.result}

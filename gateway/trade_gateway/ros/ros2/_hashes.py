@@ -96,18 +96,18 @@ def _few(type_name: str) -> Any:
     return (Nodetype.SEQUENCE, (_name(type_name), 1))
 
 
-def _as_hashed(kind: Any) -> Any:
-    match kind:
+def _as_hashed(type_: Any) -> Any:
+    match type_:
         case (Nodetype.BASE, ("char", limit)):
             return (Nodetype.BASE, ("uint8", limit))
         case ((Nodetype.ARRAY | Nodetype.SEQUENCE) as several, (inner, length)):
             return (several, (_as_hashed(inner), length))
         case _:
-            return kind
+            return type_
 
 
-def _contained(kind: Any) -> str | None:
-    match kind:
+def _contained(type_: Any) -> str | None:
+    match type_:
         case (Nodetype.NAME, type_name):
             return type_name
         case (Nodetype.ARRAY | Nodetype.SEQUENCE, (inner, _)):

@@ -27,22 +27,22 @@ _LEASE_MS: Final = 2000
 _END_S: Final = 5.0
 
 
-class Undeclares(Protocol):
+class ZenohDeclaration(Protocol):
     """A declaration of zenoh."""
 
     def undeclare(self) -> Any: ...
 
 
-Declare = Callable[[zenoh.Session], Sequence[Undeclares]]
+Declare = Callable[[zenoh.Session], Sequence[ZenohDeclaration]]
 
 
-class Declared:
+class Declaration:
     """A declaration that is made, or will be made once there is a router."""
 
     def __init__(self, link: "Link", declare: Declare) -> None:
         self._link = link
         self.declare: Final = declare
-        self.made: Sequence[Undeclares] = ()
+        self.made: Sequence[ZenohDeclaration] = ()
 
     def close(self) -> None:
         """Withdraws the declaration. Idempotent."""
@@ -60,7 +60,7 @@ class Link:
         self._router = router
         self._config = _configuration(router, self.id)
         self._lock = threading.Lock()
-        self._declared: list[Declared] = []
+        self._declared: list[Declaration] = []
         self._session: zenoh.Session | None = None
         self._closed = threading.Event()
         self._opening = threading.Thread(target=self._open, name=f"ros2 {router}", daemon=True)
@@ -81,20 +81,20 @@ class Link:
         """The session; None before the first contact with a router, and after the end."""
         return self._session
 
-    def declare(self, declare: Declare) -> Declared:
+    def declare(self, declare: Declare) -> Declaration:
         """Makes a declaration, now or once there is a session.
 
         Args:
             declare: receives the session, returns what to undeclare, in this order. It is called with a lock held.
         """
-        declared = Declared(self, declare)
+        declared = Declaration(self, declare)
         with self._lock:
             self._declared.append(declared)
             if self._session is not None:
                 declared.made = declare(self._session)
         return declared
 
-    def forget(self, declared: Declared) -> Sequence[Undeclares]:
+    def forget(self, declared: Declaration) -> Sequence[ZenohDeclaration]:
         """Returns the declarations to undeclare; nothing the second time."""
         with self._lock:
             if declared in self._declared:

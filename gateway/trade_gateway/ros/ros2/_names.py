@@ -27,7 +27,7 @@ _NODE_PARTS: Final = 9
 _ENDPOINT_PARTS: Final = 13
 
 
-class Kind(Enum):
+class TokenKind(Enum):
     """Kind of a liveliness token."""
 
     NODE = "NN"
@@ -37,11 +37,11 @@ class Kind(Enum):
     CLIENT = "SC"
 
 
-class Seen(NamedTuple):
+class TokenContent(NamedTuple):
     """The content of a liveliness token."""
 
     session: str
-    kind: Kind
+    kind: TokenKind
     node: str
     """Fully qualified: ``/arm/teleop``."""
     name: str = ""
@@ -75,14 +75,14 @@ def data_key(domain_id: int, name: str, type_name: str, type_hash: str) -> str:
 
 def node_token(domain_id: int, session: str, node: str) -> str:
     """The token of the only node of a session."""
-    return f"{_ADMIN}/{domain_id}/{session}/0/0/{Kind.NODE.value}/{_of_node(node)}"
+    return f"{_ADMIN}/{domain_id}/{session}/0/0/{TokenKind.NODE.value}/{_of_node(node)}"
 
 
 def token(
     domain_id: int,
     session: str,
     number: int,
-    kind: Kind,
+    kind: TokenKind,
     node: str,
     name: str,
     type_name: str,
@@ -99,20 +99,20 @@ def every_token(domain_id: int) -> str:
     return f"{_ADMIN}/{domain_id}/**"
 
 
-def read_token(key: str) -> Seen | None:
+def read_token(key: str) -> TokenContent | None:
     """Parses a token; None if it is not of rmw_zenoh. Ignores parts that a later version appends."""
     parts = key.split("/")
     if len(parts) < _NODE_PARTS or parts[0] != _ADMIN:
         return None
     try:
-        kind = Kind(parts[5])
+        kind = TokenKind(parts[5])
     except ValueError:
         return None
-    if kind is not Kind.NODE and len(parts) < _ENDPOINT_PARTS:
+    if kind is not TokenKind.NODE and len(parts) < _ENDPOINT_PARTS:
         return None
     namespace, node = (part.replace("%", "/") for part in parts[7:9])
-    name = "" if kind is Kind.NODE else parts[9].replace("%", "/")
-    return Seen(parts[2], kind, f"{namespace.rstrip('/')}/{node}", name)
+    name = "" if kind is TokenKind.NODE else parts[9].replace("%", "/")
+    return TokenContent(parts[2], kind, f"{namespace.rstrip('/')}/{node}", name)
 
 
 def gid(endpoint_token: str) -> bytes:

@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 import zenoh
 
 from trade_gateway.ros.ros2._hashes import Hashes
-from trade_gateway.ros.ros2._link import Declared, Link
-from trade_gateway.ros.ros2._names import Kind, absolute, data_key, gid, node_token, token
+from trade_gateway.ros.ros2._link import Declaration, Link
+from trade_gateway.ros.ros2._names import TokenKind, absolute, data_key, gid, node_token, token
 from trade_gateway.ros.ros2._presence import Presence
 from trade_gateway.ros_messages._types import Types
 
@@ -103,13 +103,13 @@ class Node:
         self.presence: Final = Presence(link, domain_id)
         self._domain_id = domain_id
         self._numbers = itertools.count(1)
-        self._declared: Declared = link.declare(self._declare)
+        self._declared: Declaration = link.declare(self._declare)
 
-    def topic(self, kind: Kind, name: str, type_name: str, qos: str) -> Endpoint:
+    def topic(self, kind: TokenKind, name: str, type_name: str, qos: str) -> Endpoint:
         """A publisher or subscription. Raises ConfigurationError: its name or type is invalid."""
         return self._endpoint(kind, name, type_name, self.hashes.message(type_name), qos)
 
-    def service(self, kind: Kind, name: str, type_name: str) -> Endpoint:
+    def service(self, kind: TokenKind, name: str, type_name: str) -> Endpoint:
         """A service server or client. Raises ConfigurationError: its name or type is invalid."""
         return self._endpoint(kind, name, type_name, self.hashes.service(type_name), USUAL)
 
@@ -122,7 +122,7 @@ class Node:
         self.presence.close()
         self._declared.close()
 
-    def _endpoint(self, kind: Kind, name: str, type_name: str, type_hash: str, qos: str) -> Endpoint:
+    def _endpoint(self, kind: TokenKind, name: str, type_name: str, type_hash: str, qos: str) -> Endpoint:
         number = next(self._numbers)
         own = token(self._domain_id, self.link.id, number, kind, self.name, name, type_name, type_hash, qos)
         made = Endpoint(data_key(self._domain_id, name, type_name, type_hash), own, gid(own))

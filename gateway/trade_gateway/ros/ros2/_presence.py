@@ -18,7 +18,7 @@ import zenoh
 from trade_gateway.ros._graph import NodeListener
 from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros.ros2._link import Link
-from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_token
+from trade_gateway.ros.ros2._names import TokenContent, TokenKind, every_token, gid, read_token
 
 _INTRODUCTION_S: Final = 0.5
 """How long a first message waits for the token of its sender, which may arrive later."""
@@ -30,10 +30,10 @@ _ENDED_S: Final = 10.0
 _MOST_ENDED: Final = 4096
 
 
-class Watching:
+class NodeSubscription:
     """A subscription to the nodes."""
 
-    def __init__(self, listener: NodeListener, end: "Callable[[Watching], None]") -> None:
+    def __init__(self, listener: NodeListener, end: "Callable[[NodeSubscription], None]") -> None:
         self._report = listener
         self._end = end
         self.mailbox: Final = Mailbox[tuple[str, bool]]("ros2 nodes", self._tell)
@@ -53,15 +53,15 @@ class Presence:
     def __init__(self, link: Link, domain_id: int) -> None:
         self._own = link.id
         self._changed = threading.Condition()
-        self._seen: dict[str, Seen] = {}
+        self._tokens: dict[str, TokenContent] = {}
         self._node_of: dict[bytes, str] = {}
         self._ended: dict[bytes, tuple[str, float]] = {}
         """Nodes of endpoints that ended, and until when they are kept; the oldest first."""
         self._nodes: Counter[str] = Counter()
-        self._offered: Counter[tuple[Kind, str]] = Counter()
+        self._offered: Counter[tuple[TokenKind, str]] = Counter()
         self._strangers: set[bytes] = set()
         self._waits_from = 0.0
-        self._watching: list[Watching] = []
+        self._watching: list[NodeSubscription] = []
         self._declared = link.declare(partial(self._listen, every_token(domain_id)))
 
     def introduce(self, endpoint_gid: bytes, node: str) -> None:
@@ -83,14 +83,14 @@ class Presence:
         with self._changed:
             return self._named(endpoint_gid)
 
-    def offered(self, kind: Kind, name: str) -> bool:
+    def offered(self, kind: TokenKind, name: str) -> bool:
         """Whether another session has such an endpoint."""
         with self._changed:
             return self._offered[kind, name] > 0
 
-    def watch(self, listener: NodeListener) -> Watching:
+    def watch(self, listener: NodeListener) -> NodeSubscription:
         """See `Graph.watch_nodes`; the bridge's own node is not reported."""
-        watching = Watching(listener, self._unwatch)
+        watching = NodeSubscription(listener, self._unwatch)
         with self._changed:
             self._watching.append(watching)
             for node in self._nodes:
@@ -105,7 +105,7 @@ class Presence:
         for each in watching:
             each.close()
 
-    def _unwatch(self, watching: Watching) -> None:
+    def _unwatch(self, watching: NodeSubscription) -> None:
         with self._changed:
             if watching in self._watching:
                 self._watching.remove(watching)
@@ -142,11 +142,11 @@ class Presence:
                 self._went(key)
             self._changed.notify_all()
 
-    def _came(self, key: str, seen: Seen) -> None:
-        if key in self._seen:
+    def _came(self, key: str, seen: TokenContent) -> None:
+        if key in self._tokens:
             return
-        self._seen[key] = seen
-        if seen.kind is Kind.NODE:
+        self._tokens[key] = seen
+        if seen.kind is TokenKind.NODE:
             self._nodes[seen.node] += 1
             if self._nodes[seen.node] == 1:
                 self._tell(seen.node, there=True)
@@ -158,10 +158,10 @@ class Presence:
         self._strangers.discard(endpoint_gid)
 
     def _went(self, key: str) -> None:
-        seen = self._seen.pop(key, None)
+        seen = self._tokens.pop(key, None)
         if seen is None:
             return
-        if seen.kind is not Kind.NODE:
+        if seen.kind is not TokenKind.NODE:
             self._offered[seen.kind, seen.name] -= 1
             if not self._offered[seen.kind, seen.name]:
                 del self._offered[seen.kind, seen.name]

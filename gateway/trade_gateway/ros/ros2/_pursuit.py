@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import GoalEnd, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros2._action import CANCEL, ENDS, Refusal, uuid
-from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._names import TokenKind
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Client, Unanswered
-from trade_gateway.ros.ros2._topics import TopicHeard
+from trade_gateway.ros.ros2._topics import TopicSubscription
 from trade_gateway.ros_messages._types import Message
 
 _ACCEPT_S: Final = 5.0
@@ -29,7 +29,7 @@ _END_S: Final = 2.0
 _HOW: Final = {int(status): how for how, status in ENDS.items()}
 
 
-class Pursuing:
+class Ros2ActionGoal:
     """A sent goal. Its own thread requests the result until it is known."""
 
     def __init__(self, node: Node, name: str, type_name: str, feedback: Callable[[Message], object] | None) -> None:
@@ -51,7 +51,9 @@ class Pursuing:
         self._hearing = (
             None
             if feedback is None
-            else TopicHeard(node, f"{start}/feedback", f"{type_name}_FeedbackMessage", self._heard, latched=False)
+            else TopicSubscription(
+                node, f"{start}/feedback", f"{type_name}_FeedbackMessage", self._heard, latched=False
+            )
         )
         self._thread = threading.Thread(target=self._follow, name=f"ros2 pursuit {name}", daemon=True)
 
@@ -82,7 +84,7 @@ class Pursuing:
             self._finish(RosRefused(what=self._name, problem="the goal was rejected"))
 
     def wait(self, timeout_s: float) -> Outcome:
-        """See `Pursuit`."""
+        """See `ActionGoal`."""
         self._over.wait(timeout_s)
         match self._outcome:
             case Outcome() as outcome:
@@ -93,7 +95,7 @@ class Pursuing:
                 raise failure
 
     def cancel(self) -> None:
-        """See `Pursuit`. Without a router, the request is repeated once there is one."""
+        """See `ActionGoal`. Without a router, the request is repeated once there is one."""
         self._unwanted = True
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable):
@@ -115,7 +117,7 @@ class Pursuing:
             try:
                 answer = self._get.call({"goal_id": uuid(self._id)}, _ASK_S)
             except RosUnreachable as unreachable:
-                if self._node.presence.offered(Kind.SERVER, self._get.name):
+                if self._node.presence.offered(TokenKind.SERVER, self._get.name):
                     last_seen = time.monotonic()
                 elif time.monotonic() - last_seen > _GONE_S:
                     self._gone(f"its server is gone: {unreachable.problem}")
@@ -166,7 +168,7 @@ class Pursuing:
         return False
 
     def _read(self, answer: Message) -> Outcome | RosUnreachable:
-        how: Ended | None = _HOW.get(answer["status"])
+        how: GoalEnd | None = _HOW.get(answer["status"])
         if how is None:
             problem = "its server does not know the goal any more; has the server restarted?"
             return RosUnreachable(what=self._name, problem=problem)

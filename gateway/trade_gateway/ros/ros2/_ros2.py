@@ -8,27 +8,27 @@ from typing import Any, TypeVar
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import (
+    ActionGoal,
     Answer,
-    Closes,
+    Closable,
     Goal,
     Graph,
     Heard,
     NodeListener,
     Outcome,
     Publisher,
-    Pursuit,
     Refuse,
 )
 from trade_gateway.ros.ros2 import _parameters
 from trade_gateway.ros.ros2._goals import Action
 from trade_gateway.ros.ros2._link import Link
 from trade_gateway.ros.ros2._node import Node
-from trade_gateway.ros.ros2._pursuit import Pursuing
+from trade_gateway.ros.ros2._pursuit import Ros2ActionGoal
 from trade_gateway.ros.ros2._services import Client, Server, answering
-from trade_gateway.ros.ros2._topics import Topic, TopicHeard
+from trade_gateway.ros.ros2._topics import Topic, TopicSubscription
 from trade_gateway.ros_messages._types import Message, Types, installed_definitions
 
-_Opened = TypeVar("_Opened", bound=Closes)
+_Opened = TypeVar("_Opened", bound=Closable)
 
 
 class Ros2(Graph):
@@ -61,7 +61,7 @@ class Ros2(Graph):
         self._types = Types(2, folders, installed_definitions(2))
         self._link = Link(router)
         self._lock = threading.Lock()
-        self._opened: weakref.WeakSet[Closes] = weakref.WeakSet()
+        self._opened: weakref.WeakSet[Closable] = weakref.WeakSet()
         self._clients: dict[tuple[str, str], Client] = {}
         try:
             self._node = Node(self._link, domain_id, node, self._types)
@@ -78,7 +78,7 @@ class Ros2(Graph):
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Topic(self._node, topic, type_name, latched=latched))
 
-    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closable:
         """See `Graph`; latched: also delivers earlier messages that the publisher keeps.
 
         While a call of `heard` lasts, at most ten messages wait, each for at most a second.
@@ -86,9 +86,9 @@ class Ros2(Graph):
         Raises:
             ConfigurationError: its name or type is invalid.
         """
-        return self._keep(TopicHeard(self._node, topic, type_name, callback, latched=latched))
+        return self._keep(TopicSubscription(self._node, topic, type_name, callback, latched=latched))
 
-    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closable:
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Server(self._node, name, type_name, answering(answer), stops=stops))
 
@@ -108,23 +108,23 @@ class Ros2(Graph):
                 client = self._clients[name, type_name] = Client(self._node, name, type_name)
         return client.call(request, timeout_s)
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closable:
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Action(self._node, name, type_name, do, refuse))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
-    ) -> Pursuit:
+    ) -> ActionGoal:
         """See `Graph`; waits up to 5 s for the goal to be accepted. Goals that still run are canceled on closing.
 
         A goal without a known answer may begin at any time. It is canceled for some seconds and counts as running
-        meanwhile; `Pursuit.wait` then raises RosUnreachable, which says whether the goal was canceled.
+        meanwhile; `ActionGoal.wait` then raises RosUnreachable, which says whether the goal was canceled.
 
         Raises:
             RosUnreachable: no node serves the action, so the goal was not sent.
             ConfigurationError: the name or type is invalid, or the goal does not fit.
         """
-        pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))
+        pursuing = self._keep(Ros2ActionGoal(self._node, name, type_name, feedback))
         pursuing.begin(goal)
         return pursuing
 
@@ -136,7 +136,7 @@ class Ros2(Graph):
         """See `Graph`. Raises also ConfigurationError: ROS has no parameters of that kind."""
         _parameters.put(self.call, node, name, value, timeout_s)
 
-    def watch_nodes(self, listener: NodeListener) -> Closes:
+    def watch_nodes(self, listener: NodeListener) -> Closable:
         """See `Graph`. The bridge's own node is not reported; for frozen or disconnected nodes see `_presence`."""
         return self._keep(self._node.presence.watch(listener))
 
@@ -149,7 +149,7 @@ class Ros2(Graph):
         with self._lock:
             opened, clients = list(self._opened), list(self._clients.values())
             self._clients.clear()
-        opened.sort(key=lambda each: not isinstance(each, Pursuing))  # what moves goes first
+        opened.sort(key=lambda each: not isinstance(each, Ros2ActionGoal))  # what moves goes first
         for each in (*opened, *clients, self._node, self._link):
             each.close()
 

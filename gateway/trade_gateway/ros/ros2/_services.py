@@ -20,8 +20,8 @@ import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
 from trade_gateway.ros._mailbox import AtOnce, Mailbox
-from trade_gateway.ros.ros2._link import CLOSED, Undeclares
-from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._link import CLOSED, ZenohDeclaration
+from trade_gateway.ros.ros2._names import TokenKind
 from trade_gateway.ros.ros2._node import Endpoint, Node
 from trade_gateway.ros_messages._types import Message
 
@@ -85,7 +85,7 @@ class Server:
     def __init__(
         self, node: Node, name: str, type_name: str, handle: Callable[[ServiceRequest], object], *, stops: bool = False
     ) -> None:
-        self._endpoint = node.service(Kind.SERVER, name, type_name)
+        self._endpoint = node.service(TokenKind.SERVER, name, type_name)
         self._node = node
         self._type_name = type_name
         self._handle = handle
@@ -102,7 +102,7 @@ class Server:
         self._declared.close()
         self._mailbox.close()
 
-    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+    def _declare(self, session: zenoh.Session) -> Sequence[ZenohDeclaration]:
         queryable = session.declare_queryable(self._endpoint.key, self._put, complete=True)
         return session.liveliness().declare_token(self._endpoint.token), queryable
 
@@ -137,7 +137,7 @@ class Client:
     """A client of a ROS service."""
 
     def __init__(self, node: Node, name: str, type_name: str) -> None:
-        self._endpoint = node.service(Kind.CLIENT, name, type_name)
+        self._endpoint = node.service(TokenKind.CLIENT, name, type_name)
         self._node = node
         self.name: Final = name
         self._type_name = type_name
@@ -188,7 +188,7 @@ class Client:
         self._declared.close()
 
     def _is_present(self) -> bool:
-        return self._node.presence.offered(Kind.SERVER, self.name)
+        return self._node.presence.offered(TokenKind.SERVER, self.name)
 
     def _ask(
         self, payload: bytes, timeout_s: float, replied: Callable[[zenoh.Reply], object], ended: Callable[[], object]
@@ -221,5 +221,5 @@ class Client:
         except ValueError as malformed:
             raise RosRefused(what=self.name, problem=f"its answer cannot be read: {malformed}") from None
 
-    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+    def _declare(self, session: zenoh.Session) -> Sequence[ZenohDeclaration]:
         return [session.liveliness().declare_token(self._endpoint.token)]

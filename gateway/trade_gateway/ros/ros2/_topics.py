@@ -18,8 +18,8 @@ import zenoh.ext
 
 from trade_gateway.ros._graph import Heard
 from trade_gateway.ros._mailbox import Mailbox
-from trade_gateway.ros.ros2._link import CLOSED, Undeclares
-from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._link import CLOSED, ZenohDeclaration
+from trade_gateway.ros.ros2._names import TokenKind
 from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node, Sender
 
 _DEPTH: Final = 10
@@ -36,7 +36,7 @@ class Topic:
     """A published topic."""
 
     def __init__(self, node: Node, topic: str, type_name: str, *, latched: bool) -> None:
-        self._endpoint = node.topic(Kind.PUBLISHER, topic, type_name, LATCHED if latched else USUAL)
+        self._endpoint = node.topic(TokenKind.PUBLISHER, topic, type_name, LATCHED if latched else USUAL)
         self._types = node.types
         self._type_name = type_name
         self._latched = latched
@@ -65,7 +65,7 @@ class Topic:
             with contextlib.suppress(*CLOSED):
                 self._publisher.put(payload, attachment=self._endpoint.attachment(next(self._sequence)))
 
-    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+    def _declare(self, session: zenoh.Session) -> Sequence[ZenohDeclaration]:
         publisher = self._advanced(session) if self._latched else self._plain(session)
         token = session.liveliness().declare_token(self._endpoint.token)
         with self._sending:
@@ -91,14 +91,14 @@ class Topic:
         )
 
 
-class TopicHeard:
+class TopicSubscription:
     """A topic subscription."""
 
     def __init__(self, node: Node, topic: str, type_name: str, callback: Heard, *, latched: bool) -> None:
-        self._endpoint = node.topic(Kind.SUBSCRIPTION, topic, type_name, LATCHED if latched else USUAL)
+        self._endpoint = node.topic(TokenKind.SUBSCRIPTION, topic, type_name, LATCHED if latched else USUAL)
         self._node = node
         self._type_name = type_name
-        self._heard = callback
+        self._callback = callback
         self._latched = latched
         longest_s = float("inf") if latched else _LATE_S
         self._mailbox = Mailbox[_Came](f"ros2 {topic}", self._tell, most=_DEPTH, longest_s=longest_s)
@@ -119,9 +119,9 @@ class TopicHeard:
         except ValueError as malformed:
             _log.warning("a message on %s is dropped: %s", sample.key_expr, malformed)
             return
-        self._heard(message, sender.name())
+        self._callback(message, sender.name())
 
-    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+    def _declare(self, session: zenoh.Session) -> Sequence[ZenohDeclaration]:
         token = session.liveliness().declare_token(self._endpoint.token)
         if not self._latched:
             return token, session.declare_subscriber(self._endpoint.key, self._put)

@@ -12,7 +12,7 @@ from trade import Constraint, Handle, where
 from trade.errors import ConfigurationError
 from trade_gateway.ros._file import ActionEntry, GripperEntry
 from trade_gateway.ros._goals import Unacceptable
-from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
+from trade_gateway.ros._graph import Closable, Goal, GoalEnd, Graph
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros.from_ros._sent_goals import TEXTS
@@ -49,14 +49,14 @@ class ActionsToRos:
         for handle in named_services(self._entry.service, found):
             yield Place("action", self._entry.action), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         meaning = _AnyAction(self._entry, self._graph.types, handle)
         goals = ServedGoals(handle, self._nodes, meaning)
         return self._graph.act(place.name, self._entry.type, goals.carry_out, goals.refuse)
 
 
 class _AnyAction:
-    """See `Meaning`: fields by their names, or as the entry maps them."""
+    """See `ActionMeaning`: fields by their names, or as the entry maps them."""
 
     def __init__(self, entry: ActionEntry, types: Types, handle: Handle) -> None:
         goal, result, feedback = types.parts(entry.type)
@@ -85,7 +85,7 @@ class _AnyAction:
             self._unfit = True
             return None
 
-    def result_of(self, how: Ended, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `Meaning`
+    def result_of(self, how: GoalEnd, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `ActionMeaning`
         if error is None:
             return self._result(value, time.time())
         return {self._text: failure(error)} if self._text else {}
@@ -113,7 +113,7 @@ class GrippersToRos:
         for handle in named_services(f"{self._entry.group}.move_to", found):
             yield Place("action", self._entry.action), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         entry = self._entry
         joint = entry.joint or entry.group.rpartition(".")[2]
         meaning = (
@@ -124,7 +124,7 @@ class GrippersToRos:
 
 
 class _Gripper:
-    """See `Meaning`: GripperCommand, whose position is the width in m and whose effort is a force in N."""
+    """See `ActionMeaning`: GripperCommand, whose position is the width in m and whose effort is a force in N."""
 
     purpose = "a command"
 
@@ -149,7 +149,7 @@ class _Gripper:
         state: Any = msgspec.to_builtins(progress)
         return self._message(cast("Message", state)) if isinstance(state, dict) and "width_m" in state else None
 
-    def result_of(self, how: Ended, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `Meaning`
+    def result_of(self, how: GoalEnd, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `ActionMeaning`
         return {} if error is not None else self._message(msgspec.to_builtins(value))
 
     def _message(self, state: Mapping[str, Any]) -> Message:

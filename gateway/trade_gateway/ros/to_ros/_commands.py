@@ -15,9 +15,9 @@ from trade import Constraint, Container, Handle, Run, where
 from trade.errors import ConfigurationError, TradeError
 from trade_gateway.clients._clients import Client
 from trade_gateway.ros._file import Command
-from trade_gateway.ros._graph import Closes, Graph
+from trade_gateway.ros._graph import Closable, Graph
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
-from trade_gateway.ros._nodes import Guest, Nodes
+from trade_gateway.ros._nodes import NodeClient, Nodes
 from trade_gateway.ros_messages._conversion import RequestMapping, failure
 from trade_gateway.ros_messages._types import Message
 
@@ -55,7 +55,7 @@ class CommandsToRos:
         for handle in named_services(self._entry.service, found):
             yield Place("command", self._entry.topic), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         entry = self._entry
         if handle.effect == "stop":
             problem = "is a stop, which any node may call at any time; a topic accepts one node. Use [[to_ros.service]]"
@@ -107,17 +107,17 @@ class _TopicExecutor:
         self._owner: str | None = None
         self._last_message_at = 0.0
         self._closing = False
-        self._guest: Guest | None = None
+        self._guest: NodeClient | None = None
         self._watched: Client | None = None
         """The client whose end wakes the thread."""
         self._held_locks = ExitStack()
         self._runs: list[Run] = []
         self._problem = ("", 0.0)
-        self._subscription: Closes | None = None
+        self._subscription: Closable | None = None
         self._thread = threading.Thread(target=self._run, name="trade-ros-command", daemon=True)
         self._thread.start()
 
-    def set_subscription(self, subscription: Closes) -> None:
+    def set_subscription(self, subscription: Closable) -> None:
         """Sets the subscription that delivers the messages."""
         self._subscription = subscription
 
@@ -217,7 +217,7 @@ class _TopicExecutor:
         if not self._closing:
             self._report(reason if not moved or guest is None else f"{reason}; {self._handle.label} was stopped")
 
-    def _stop(self, guest: Guest, reason: str) -> None:
+    def _stop(self, guest: NodeClient, reason: str) -> None:
         runs: list[Run] = []
         for stop in self._stops:
             try:

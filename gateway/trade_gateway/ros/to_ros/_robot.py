@@ -9,7 +9,7 @@ from trade import Container
 from trade.text_files import read_text
 from trade_gateway.ros._file import RobotEntry
 from trade_gateway.ros._graph import Graph
-from trade_gateway.ros._joints import Measured
+from trade_gateway.ros._joints import JointMeasurement
 from trade_gateway.ros._urdf import Transform, UrdfJoint, read_urdf
 from trade_gateway.ros.to_ros._streams import LimbTopic, Topics
 from trade_gateway.ros_messages._conversion import ros_stamp
@@ -49,7 +49,7 @@ class TransformsToRos(LimbTopic):
         self._moving = [one for one in read_urdf(description, entry.urdf) if not one.fixed]
         self._turning = {joint.name for joint in self._moving if joint.turns}
 
-    def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:
+    def _message(self, names: Sequence[str], now: JointMeasurement, at_s: float) -> Message:
         positions = dict(zip(names, now.positions, strict=True))
         if now.is_width:  # in m, which is no angle
             positions = {name: width_m for name, width_m in positions.items() if name not in self._turning}

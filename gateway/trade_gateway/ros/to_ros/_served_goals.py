@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from trade import Handle, Run
 from trade.errors import SessionEnded
 from trade_gateway.ros._goals import Unacceptable
-from trade_gateway.ros._graph import Ended, Goal, Outcome
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros_messages._conversion import failure
 from trade_gateway.ros_messages._types import Message
@@ -30,7 +30,7 @@ class CallOfGoal(NamedTuple):
     deadline_s: float
 
 
-class Meaning(Protocol):
+class ActionMeaning(Protocol):
     """What the goals, the feedback and the results of an action mean."""
 
     @property
@@ -50,7 +50,7 @@ class Meaning(Protocol):
         """The feedback for progress of the call; None: it has none."""
         ...
 
-    def result_of(self, how: Ended, value: Any, error: BaseException | None) -> Message:
+    def result_of(self, how: GoalEnd, value: Any, error: BaseException | None) -> Message:
         """The result for what the call returned, or for the reason why it did not."""
         ...
 
@@ -64,7 +64,7 @@ class ServedGoals:
         meaning: of the action.
     """
 
-    def __init__(self, handle: Handle, nodes: Nodes, meaning: Meaning) -> None:
+    def __init__(self, handle: Handle, nodes: Nodes, meaning: ActionMeaning) -> None:
         self._handle = handle
         self._nodes = nodes
         self._meaning = meaning
@@ -80,7 +80,7 @@ class ServedGoals:
             if str(why) != self._refused:  # a node may send the same goal again and again
                 _logger.warning("a goal for %s is rejected: %s", self._handle.label, why)
             self._refused = str(why)
-            return self._outcome(Ended.ABORTED, why)
+            return self._outcome(GoalEnd.ABORTED, why)
         return None
 
     def carry_out(self, goal: Goal) -> Outcome:
@@ -88,7 +88,7 @@ class ServedGoals:
         canceling = _Canceling(goal)
         # the previous goal was canceled, and its stop must not stop this one
         if not self._turn.acquire(timeout=_TURN_WITHIN_S):
-            return self._outcome(Ended.ABORTED, Unacceptable(-1, "the goal before it does not end"))
+            return self._outcome(GoalEnd.ABORTED, Unacceptable(-1, "the goal before it does not end"))
         try:
             return self._carried_out(goal, canceling)
         finally:
@@ -105,17 +105,17 @@ class ServedGoals:
                     purpose = f"{self._meaning.purpose} of {guest.named}"
                     held.enter_context(guest.grips.hold([handle], purpose, _WAIT_S))
                 if canceling.asked:
-                    return self._outcome(Ended.CANCELED, Unacceptable(0, "canceled before it began"))
+                    return self._outcome(GoalEnd.CANCELED, Unacceptable(0, "canceled before it began"))
                 run = guest.begin(handle, args, deadline_s, goal.came_at, admitted)
                 run.on_progress(lambda progress: _try(lambda: self._tell(goal, progress)))
                 canceling.ends(lambda: guest.client.cancel(run))
                 value = _result(run, deadline_s, canceling)
-            return Outcome(Ended.SUCCEEDED, self._meaning.result_of(Ended.SUCCEEDED, value, None))
+            return Outcome(GoalEnd.SUCCEEDED, self._meaning.result_of(GoalEnd.SUCCEEDED, value, None))
         except Exception as error:  # noqa: BLE001 - reported to its client, whatever it is
             canceled = canceling.asked and not isinstance(error, Unacceptable)
-            return self._outcome(Ended.CANCELED if canceled else Ended.ABORTED, error)
+            return self._outcome(GoalEnd.CANCELED if canceled else GoalEnd.ABORTED, error)
 
-    def _outcome(self, how: Ended, error: BaseException) -> Outcome:
+    def _outcome(self, how: GoalEnd, error: BaseException) -> Outcome:
         return Outcome(how, self._meaning.result_of(how, None, error), text_of(error))
 
     def _tell(self, goal: Goal, progress: object) -> None:

@@ -7,7 +7,7 @@ from trade import Constraint, Container, Handle, Lock, where
 from trade.errors import ConfigurationError
 from trade_gateway.clients._clients import Client
 from trade_gateway.ros._file import LockService, ServiceEntry
-from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
+from trade_gateway.ros._graph import Answer, Closable, Graph, RosRefused
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services
 from trade_gateway.ros._nodes import UNKNOWN, Nodes
 from trade_gateway.ros_messages._conversion import RequestMapping, ResponseMapping, ros_path
@@ -73,7 +73,7 @@ class ServicesToRos:
             raise ConfigurationError(where=f"{self._entry.type} for {handle.label}", problem=problem)
         return asked
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         asked, response, deadline_s = self._asked(handle), self._response, self._entry.deadline_s
 
         stops = handle.effect == "stop"
@@ -93,7 +93,7 @@ class LocksToRos:
         self._graph = graph
         self._nodes = nodes
         self._container = container
-        self._taken: dict[str, _ClientLock] = {}
+        self._locks: dict[str, _ClientLock] = {}
         """By node."""
 
     @property
@@ -110,7 +110,7 @@ class LocksToRos:
             name = self._entry.name or ros_path(self._entry.group, "lock")
             yield Place("service", name, f"a lock over {self._entry.group}"), first
 
-    def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - the lock covers a whole group
+    def open(self, place: Place, handle: Handle) -> Closable:  # noqa: ARG002 - the lock covers a whole group
         response = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
         def answer(request: Message, client: str, came_at: float) -> Message:
@@ -119,31 +119,31 @@ class LocksToRos:
 
         return self._graph.serve(place.name, _SET_BOOL, answering(response, answer))
 
-    def _take(self, who: str, came_at: float) -> str:
-        if who == UNKNOWN:
+    def _take(self, client_name: str, came_at: float) -> str:
+        if client_name == UNKNOWN:
             problem = "ROS does not identify the caller, so its end would be invisible. A lock needs a known node"
             raise RosRefused(what=f"lock of {self._entry.group}", problem=problem)
-        guest, before = self._nodes.guest(who, came_at), self._taken.get(who)
+        guest, before = self._nodes.guest(client_name, came_at), self._locks.get(client_name)
         client, wanted = guest.client, where(group=self._entry.group)
         if before is not None and before.client is client and before.lock.held:
             return f"it has {', '.join(before.lock.resources)}"
-        self._give_back(who)
+        self._give_back(client_name)
         client.locking()
         with client.session.use():
-            purpose = f"of {who}, a node of ROS"
+            purpose = f"of {client_name}, a node of ROS"
             lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
         handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
-        taken = self._taken[who] = _ClientLock(client, lock, client.keep(lock, handles))
-        client.when_closed(lambda: self._forget(who, taken))
+        taken = self._locks[client_name] = _ClientLock(client, lock, client.keep(lock, handles))
+        client.when_closed(lambda: self._forget(client_name, taken))
         client.session.check()
         return ", ".join(lock.resources)
 
     def _forget(self, client: str, taken: _ClientLock) -> None:
-        if self._taken.get(client) is taken:
-            del self._taken[client]
+        if self._locks.get(client) is taken:
+            del self._locks[client]
 
     def _give_back(self, client: str) -> str:
-        taken = self._taken.pop(client, None)
+        taken = self._locks.pop(client, None)
         given_back = taken is not None and not taken.client.closed and taken.client.unlock(taken.name)
         return "released" if given_back else "it had none"
 

@@ -8,8 +8,8 @@ from typing import Final
 
 from trade import Constraint, Container, Handle, Sample, Stream, where
 from trade_gateway.ros._file import JointStates, RobotEntry, StreamEntry
-from trade_gateway.ros._graph import Closes, Graph, Publisher
-from trade_gateway.ros._joints import LIMBS, Measured, joints_of, limbs, measured
+from trade_gateway.ros._graph import Closable, Graph, Publisher
+from trade_gateway.ros._joints import LIMBS, JointMeasurement, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros_messages._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros_messages._joint_names import JointNames
@@ -70,7 +70,7 @@ class StreamsToRos:
         for handle in named_services(self._entry.service, found):
             yield Place("topic", self._entry.topic), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         entry, response = self._entry, self._response
         stream = self._container.stream(handle, hz=entry.hz)
         return _Pump(stream, self._topics, place.name, entry.type, lambda sample: response(sample.value, sample.at))
@@ -108,7 +108,7 @@ class LimbTopic(ABC):
         for handle in limbs(found, self._entry.group, "state"):
             yield Place("topic", self._topic), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         entry, joints = self._entry, joints_of(self._container, handle)
         named = {ros_name: own for ros_name, own in entry.joints.items() if own in joints}
         names = JointNames(joints, short=entry.names == "last", named=named)
@@ -124,7 +124,7 @@ class LimbTopic(ABC):
         return _Pump(stream, self._topics, place.name, self._type_name, message)
 
     @abstractmethod
-    def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:
+    def _message(self, names: Sequence[str], now: JointMeasurement, at_s: float) -> Message:
         """The message for measurements of joints with these names in ROS, made at a time in seconds since the epoch."""
 
 
@@ -134,7 +134,7 @@ class JointStatesToRos(LimbTopic):
     def __init__(self, entry: JointStates, topics: Topics, container: Container) -> None:
         super().__init__(entry, entry.topic, _JOINT_STATE, topics, container)
 
-    def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:
+    def _message(self, names: Sequence[str], now: JointMeasurement, at_s: float) -> Message:
         return {
             "header": {"stamp": ros_stamp(at_s)},
             "name": list(names),

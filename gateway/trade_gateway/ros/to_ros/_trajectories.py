@@ -20,7 +20,7 @@ from trade_gateway.ros._goals import (
     tolerances_of,
     trajectory_of,
 )
-from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
+from trade_gateway.ros._graph import Closable, Goal, GoalEnd, Graph
 from trade_gateway.ros._joints import LIMBS, beside, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place
 from trade_gateway.ros._nodes import Nodes
@@ -59,7 +59,7 @@ class TrajectoriesToRos:
         for handle in limbs(found, self._entry.group, "follow"):
             yield Place("action", self._entry.action), handle
 
-    def open(self, place: Place, handle: Handle) -> Closes:
+    def open(self, place: Place, handle: Handle) -> Closable:
         entry = self._entry
         joints = joints_of(self._container, handle)
         names = JointNames(joints, short=entry.names == "last", named=entry.joints)
@@ -76,7 +76,7 @@ class TrajectoriesToRos:
 
 
 class _ClosesAll:
-    def __init__(self, *parts: Closes) -> None:
+    def __init__(self, *parts: Closable) -> None:
         self._parts = parts
 
     def close(self) -> None:
@@ -99,8 +99,8 @@ class TopicGoals:
         self._thread = threading.Thread(target=self._run, name=f"trade-ros{topic}", daemon=True)
         self._thread.start()
 
-    def _on_message(self, message: Message, who: str) -> None:
-        goal = _TopicGoal({**self._zero, "trajectory": message}, who)
+    def _on_message(self, message: Message, sender: str) -> None:
+        goal = _TopicGoal({**self._zero, "trajectory": message}, sender)
         ends = not message["points"]
         if ends or self._goals.refuse(goal.message) is None:
             self._replace(None if ends else goal)
@@ -115,7 +115,7 @@ class TopicGoals:
     def _run(self) -> None:
         while (goal := self._take()) is not None:
             outcome = self._goals.carry_out(goal)
-            if outcome.how is Ended.ABORTED:
+            if outcome.how is GoalEnd.ABORTED:
                 _logger.warning("a trajectory of %s on %s failed: %s", goal.client, self._topic, outcome.text)
 
     def _take(self) -> "_TopicGoal | None":
@@ -165,7 +165,7 @@ class _TopicGoal:
 
 
 class _Trajectories:
-    """See `Meaning`."""
+    """See `ActionMeaning`."""
 
     purpose = "a trajectory"
 
@@ -198,6 +198,6 @@ class _Trajectories:
             "error": {"positions": [-error for error in errors]},  # in ROS: desired minus actual
         }
 
-    def result_of(self, how: Ended, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `Meaning`
-        code = code_of(error) if error is not None and how is Ended.ABORTED else SUCCESSFUL
+    def result_of(self, how: GoalEnd, value: Any, error: BaseException | None) -> Message:  # noqa: ARG002 - see `ActionMeaning`
+        code = code_of(error) if error is not None and how is GoalEnd.ABORTED else SUCCESSFUL
         return {"error_code": code, "error_string": "" if error is None else text_of(error)}

@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.ros1_system import Peer, Stand, our_node
 from tests.support.waiting import PATIENCE_S, wait_until
-from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import ActionGoal, Goal, GoalEnd, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _action_client
 
 pytestmark = pytest.mark.realtime
@@ -28,7 +28,7 @@ def server(stand: Stand, name: str = "mover", job: str = "act") -> Peer:
     return peer
 
 
-def pursue(graph: Ros1, goal: int, heard: list[int] | None = None) -> Pursuit:
+def pursue(graph: Ros1, goal: int, heard: list[int] | None = None) -> ActionGoal:
     def feedback(message: dict[str, Any]) -> None:
         if heard is not None:
             heard.append(message["feedback"])
@@ -40,7 +40,7 @@ def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -
     server(stand)
     heard: list[int] = []
     outcome = pursue(graph, 20, heard).wait(PATIENCE_S)
-    assert outcome == Outcome(Ended.SUCCEEDED, {"result": 20}, "there")
+    assert outcome == Outcome(GoalEnd.SUCCEEDED, {"result": 20}, "there")
     assert heard  # feedback and result come on connections of their own, so the last of it may be late
     assert heard == list(range(1, len(heard) + 1))
 
@@ -52,12 +52,12 @@ def test_a_goal_is_canceled(graph: Ros1, stand: Stand) -> None:
     wait_until(lambda: heard, "it runs")
     goal.cancel()
     outcome = goal.wait(PATIENCE_S)
-    assert (outcome.how, outcome.text) == (Ended.CANCELED, "as you wish")
+    assert (outcome.how, outcome.text) == (GoalEnd.CANCELED, "as you wish")
 
 
 def test_a_goal_that_the_server_aborts_says_so(graph: Ros1, stand: Stand) -> None:
     server(stand)
-    assert pursue(graph, ABORTS).wait(PATIENCE_S) == Outcome(Ended.ABORTED, {"result": ABORTS}, "too far")
+    assert pursue(graph, ABORTS).wait(PATIENCE_S) == Outcome(GoalEnd.ABORTED, {"result": ABORTS}, "too far")
 
 
 def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
@@ -78,7 +78,7 @@ def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_
     with pytest.raises(RosUnreachable, match="its end was not received within"):
         goal.wait(0.05)
     goal.cancel()
-    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    assert goal.wait(PATIENCE_S).how is GoalEnd.CANCELED
 
 
 def test_a_goal_whose_server_is_killed_fails_and_the_next_server_takes_goals(graph: Ros1, stand: Stand) -> None:
@@ -90,7 +90,7 @@ def test_a_goal_whose_server_is_killed_fails_and_the_next_server_takes_goals(gra
     with pytest.raises(RosUnreachable, match="server /mover is gone"):
         goal.wait(PATIENCE_S)
     server(stand)
-    assert pursue(graph, 2).wait(PATIENCE_S).how is Ended.SUCCEEDED
+    assert pursue(graph, 2).wait(PATIENCE_S).how is GoalEnd.SUCCEEDED
 
 
 class Lossy:
@@ -116,7 +116,7 @@ def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypa
     client = graph._clients["/move"]
     monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 3))
     goal.cancel()
-    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    assert goal.wait(PATIENCE_S).how is GoalEnd.CANCELED
     peer.wait_for("preempted")
 
 
@@ -127,7 +127,7 @@ def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) ->
     wait_until(lambda: heard, "it runs")
     our_node().kill()
     goal.cancel()
-    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    assert goal.wait(PATIENCE_S).how is GoalEnd.CANCELED
 
 
 def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
@@ -155,7 +155,7 @@ def test_calls_in_progress_are_canceled_when_we_close(graph: Ros1, stand: Stand)
     client = graph._clients["/move"]
     graph.close()
     peer.wait_for("preempted")
-    assert goal.wait(0).how is Ended.CANCELED
+    assert goal.wait(0).how is GoalEnd.CANCELED
     with pytest.raises(RosUnreachable):
         client.pursue({"goal": 1}, None)
 
@@ -185,13 +185,13 @@ class Mover:
         if number == ENDLESS:
             assert ends.wait(PATIENCE_S)
             self.canceled.append(number)
-            return Outcome(Ended.CANCELED, {"result": 1}, "stopped")
+            return Outcome(GoalEnd.CANCELED, {"result": 1}, "stopped")
         if number == ABORTS:
             raise RuntimeError("a joint is stuck")
         for step in range(1, number + 1):
             goal.feedback({"feedback": step})
         assert self.go_on.wait(PATIENCE_S)
-        return Outcome(Ended.SUCCEEDED, {"result": number}, "done")
+        return Outcome(GoalEnd.SUCCEEDED, {"result": number}, "done")
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def test_a_client_learns_why_its_goal_is_rejected_and_the_one_before_it_continue
     mover.go_on.clear()
 
     def refuse(message: dict[str, int]) -> Outcome | None:
-        return Outcome(Ended.ABORTED, {"result": -7}, "too far") if message["goal"] > 9 else None
+        return Outcome(GoalEnd.ABORTED, {"result": -7}, "too far") if message["goal"] > 9 else None
 
     graph.act("/move", TEST, mover.do, refuse)
     first = client(stand, 3)
@@ -274,7 +274,7 @@ def test_a_client_receives_reports_of_failures(mover: Mover, stand: Stand) -> No
 
 
 def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand: Stand) -> None:
-    graph.act("/move", TEST, lambda goal: Outcome(Ended.SUCCEEDED, {"resolt": 1}))
+    graph.act("/move", TEST, lambda goal: Outcome(GoalEnd.SUCCEEDED, {"resolt": 1}))
     reported = client(stand, 1).wait_for("done")
     assert reported["state"] == ABORTED
     assert "has no resolt" in reported["text"]
@@ -296,7 +296,7 @@ def test_a_goal_that_waits_for_the_end_of_another_is_recalled_by_the_next(graph:
     def do(goal: Goal) -> Outcome:
         done.append(goal.message["goal"])
         assert go_on.wait(PATIENCE_S)
-        return Outcome(Ended.SUCCEEDED, {})
+        return Outcome(GoalEnd.SUCCEEDED, {})
 
     graph.act("/move", TEST, do)
     peers: list[Peer] = []
@@ -336,8 +336,8 @@ def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -
 
 def test_our_two_ends_understand_each_other(mover: Mover, graph: Ros1) -> None:
     heard: list[int] = []
-    assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(Ended.SUCCEEDED, {"result": 3}, "done")
+    assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(GoalEnd.SUCCEEDED, {"result": 3}, "done")
     goal = pursue(graph, ENDLESS)
     wait_until(lambda: (ENDLESS, "/trade") in mover.came, "it runs")
     goal.cancel()
-    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    assert goal.wait(PATIENCE_S).how is GoalEnd.CANCELED

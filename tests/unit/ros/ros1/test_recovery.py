@@ -9,7 +9,7 @@ import pytest
 from tests.support.ros1_system import Stand, our_node
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Ended, Goal, Outcome, RosUnreachable
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1
 
 pytestmark = pytest.mark.realtime
@@ -174,7 +174,7 @@ def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> Non
     seen = len(heard)
     wait_until(lambda: len(heard) > seen + 20, "it is heard of again")
     goal.cancel()
-    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    assert goal.wait(PATIENCE_S).how is GoalEnd.CANCELED
 
 
 def test_a_result_that_arrives_while_our_node_is_dead_is_delivered(graph: Ros1, stand: Stand) -> None:
@@ -184,7 +184,7 @@ def test_a_result_that_arrives_while_our_node_is_dead_is_delivered(graph: Ros1, 
         if goal.message["goal"] == 5:
             our_node().kill()
             killed.append(True)
-        return Outcome(Ended.SUCCEEDED, {"result": 7})
+        return Outcome(GoalEnd.SUCCEEDED, {"result": 7})
 
     graph.act("/move", "actionlib/action/Test", do)
     peer = stand.peer("planner")

@@ -184,7 +184,7 @@ def test_a_service_that_stops_is_called_however_many_other_calls_are_under_way(g
     wait_until(lambda: is_answered(graph), "it is found")
     pool = ThreadPoolExecutor(_link._AT_ONCE)
     calls = [pool.submit(graph.call, "/hang", TRIGGER, {}, PATIENCE_S) for _ in range(_link._AT_ONCE)]
-    wait_until(lambda: len(graph._link._asked) == _link._AT_ONCE, "all turns are taken")
+    wait_until(lambda: len(graph._link._pending_answers) == _link._AT_ONCE, "all turns are taken")
     with pytest.raises(RosUnreachable, match="other requests are pending"):
         graph.call("/stop", TRIGGER, {}, 0.1)
     assert graph.call("/stop", TRIGGER, {}, PATIENCE_S, stops=True)["success"]

@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 
 from tests.support.ros2_processes import until_served
-from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit
+from trade_gateway.ros._graph import ActionGoal, Goal, GoalEnd, Outcome
 from trade_gateway.ros.ros2 import Ros2
 
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -66,7 +66,7 @@ def ask(session: zenoh.Session, action: str, part: str, payload: bytes) -> bytes
     return answer[4:]
 
 
-def pursue(graph: Ros2, action: str, order: int, feedback: Callable[[Any], object] | None = None) -> Pursuit:
+def pursue(graph: Ros2, action: str, order: int, feedback: Callable[[Any], object] | None = None) -> ActionGoal:
     for part in ("send_goal", "cancel_goal", "get_result"):
         until_served(graph._link.session, key(action, part))
     return graph.pursue(f"/{action}", FIBONACCI, {"order": order}, feedback)
@@ -88,4 +88,4 @@ class Doing:
         while not ended.is_set() and not self.go_on.wait(0.02):
             pass
         sequence = [goal.message["order"]]
-        return Outcome(Ended.CANCELED if canceled.is_set() else Ended.SUCCEEDED, {"sequence": sequence})
+        return Outcome(GoalEnd.CANCELED if canceled.is_set() else GoalEnd.SUCCEEDED, {"sequence": sequence})

@@ -26,9 +26,9 @@ from tests.unit.ros.ros2.fibonacci_action import (
     pursue,
 )
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Ended, Goal, Outcome, RosUnreachable
+from trade_gateway.ros._graph import Goal, GoalEnd, Outcome, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
-from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._names import TokenKind
 
 pytestmark = pytest.mark.realtime
 
@@ -53,7 +53,7 @@ def test_a_goal_that_is_refused_is_not_accepted_and_the_one_before_it_is_not_can
     doing = Doing()
 
     def refuse(message: dict[str, int]) -> Outcome | None:
-        return Outcome(Ended.ABORTED, {}, "too many") if message["order"] > 9 else None
+        return Outcome(GoalEnd.ABORTED, {}, "too many") if message["order"] > 9 else None
 
     graph.act("/fib11", FIBONACCI, doing, refuse)
     assert ask(raw, "fib11", "send_goal", ID + struct.pack("<i", 5))[0] == 1
@@ -176,7 +176,7 @@ def test_a_goal_is_pursued_to_its_end(graph: Ros2, other: Ros2) -> None:
     pursuit = pursue(other, "fib", 6, feedback.append)
     wait_until(lambda: feedback, "feedback is delivered")
     doing.go_on.set()
-    assert pursuit.wait(LONG_S) == Outcome(Ended.SUCCEEDED, {"sequence": [6]})
+    assert pursuit.wait(LONG_S) == Outcome(GoalEnd.SUCCEEDED, {"sequence": [6]})
     assert doing.goals[0].client == "/client"
     assert feedback == [{"sequence": [0, 1]}]
 
@@ -187,9 +187,9 @@ def test_a_later_goal_cancels_the_one_before(graph: Ros2, other: Ros2) -> None:
     first = pursue(other, "one_at_a_time", 1)
     wait_until(lambda: doing.goals, "the first has begun")
     second = pursue(other, "one_at_a_time", 2)
-    assert first.wait(LONG_S) == Outcome(Ended.CANCELED, {"sequence": [1]})
+    assert first.wait(LONG_S) == Outcome(GoalEnd.CANCELED, {"sequence": [1]})
     doing.go_on.set()
-    assert second.wait(LONG_S) == Outcome(Ended.SUCCEEDED, {"sequence": [2]})
+    assert second.wait(LONG_S) == Outcome(GoalEnd.SUCCEEDED, {"sequence": [2]})
 
 
 def test_a_goal_that_fails_is_aborted(graph: Ros2, other: Ros2, caplog: pytest.LogCaptureFixture) -> None:
@@ -197,12 +197,12 @@ def test_a_goal_that_fails_is_aborted(graph: Ros2, other: Ros2, caplog: pytest.L
         raise ValueError("no")
 
     graph.act("/failing", FIBONACCI, fail)
-    assert pursue(other, "failing", 1).wait(LONG_S) == Outcome(Ended.ABORTED, {"sequence": []})
+    assert pursue(other, "failing", 1).wait(LONG_S) == Outcome(GoalEnd.ABORTED, {"sequence": []})
 
 
 def test_a_result_that_does_not_fit_aborts_the_goal(graph: Ros2, other: Ros2, caplog: pytest.LogCaptureFixture) -> None:
-    graph.act("/misfit", FIBONACCI, lambda goal: Outcome(Ended.SUCCEEDED, {"no such field": 1}))
-    assert pursue(other, "misfit", 1).wait(LONG_S).how is Ended.ABORTED
+    graph.act("/misfit", FIBONACCI, lambda goal: Outcome(GoalEnd.SUCCEEDED, {"no such field": 1}))
+    assert pursue(other, "misfit", 1).wait(LONG_S).how is GoalEnd.ABORTED
 
 
 def test_a_closed_action_cancels_its_goals_and_reports_their_end(graph: Ros2, other: Ros2) -> None:
@@ -212,9 +212,9 @@ def test_a_closed_action_cancels_its_goals_and_reports_their_end(graph: Ros2, ot
     wait_until(lambda: doing.goals and doing.goals[0].waiting, "its client has asked for the result")
     action.close()
     action.close()
-    assert pursuit.wait(LONG_S).how is Ended.CANCELED
+    assert pursuit.wait(LONG_S).how is GoalEnd.CANCELED
     served = "/closing/_action/send_goal"
-    wait_until(lambda: not other._node.presence.offered(Kind.SERVER, served), "the end of the action is seen")
+    wait_until(lambda: not other._node.presence.offered(TokenKind.SERVER, served), "the end of the action is seen")
     with pytest.raises(RosUnreachable, match="no node serves it"):
         other.pursue("/closing", FIBONACCI, {"order": 1})
 

@@ -10,8 +10,8 @@ from zenoh_ros2_sdk.qos import QosDurability, QosHistoryKind, QosProfile, QosRel
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros.ros2._names import (
-    Kind,
-    Seen,
+    TokenContent,
+    TokenKind,
     absolute,
     data_key,
     dds_type,
@@ -60,20 +60,22 @@ def test_keys_are_those_of_the_design_document(
 
 
 TOKENS = {
-    "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener": Seen(
-        "aac3178e146ba6f1fc6e6a4085e77f21", Kind.NODE, "/listener"
+    "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener": TokenContent(
+        "aac3178e146ba6f1fc6e6a4085e77f21", TokenKind.NODE, "/listener"
     ),
     "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/"
-    f"{STRING_HASH}/::,10:,:,:,,": Seen("aac3178e146ba6f1fc6e6a4085e77f21", Kind.SUBSCRIPTION, "/listener", "/chatter"),
+    f"{STRING_HASH}/::,10:,:,:,,": TokenContent(
+        "aac3178e146ba6f1fc6e6a4085e77f21", TokenKind.SUBSCRIPTION, "/listener", "/chatter"
+    ),
     "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints/"
-    f"example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}/::,10:,:,:,,": Seen(
-        "f9980ee0495eaafb3e38f0d19e2eae12", Kind.SERVER, "/add_two_ints_server", "/add_two_ints"
+    f"example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}/::,10:,:,:,,": TokenContent(
+        "f9980ee0495eaafb3e38f0d19e2eae12", TokenKind.SERVER, "/add_two_ints_server", "/add_two_ints"
     ),
 }
 
 
 @pytest.mark.parametrize(("written", "seen"), TOKENS.items(), ids=[seen.kind.value for seen in TOKENS.values()])
-def test_tokens_of_the_design_document_are_read(written: str, seen: Seen) -> None:
+def test_tokens_of_the_design_document_are_read(written: str, seen: TokenContent) -> None:
     assert read_token(written) == seen
 
 
@@ -82,10 +84,11 @@ def test_tokens_are_written_as_in_the_design_document() -> None:
     listener = "aac3178e146ba6f1fc6e6a4085e77f21"
     assert node_token(2, listener, "/listener") == node
     assert (
-        token(2, listener, 10, Kind.SUBSCRIPTION, "/listener", "/chatter", STRING, STRING_HASH, USUAL) == subscription
+        token(2, listener, 10, TokenKind.SUBSCRIPTION, "/listener", "/chatter", STRING, STRING_HASH, USUAL)
+        == subscription
     )
     adder, name = "f9980ee0495eaafb3e38f0d19e2eae12", "/add_two_ints_server"
-    assert token(2, adder, 10, Kind.SERVER, name, "/add_two_ints", ADD, ADD_HASH, USUAL) == server
+    assert token(2, adder, 10, TokenKind.SERVER, name, "/add_two_ints", ADD, ADD_HASH, USUAL) == server
 
 
 @pytest.mark.parametrize(
@@ -126,10 +129,17 @@ def test_names_are_taken_that_another_package_takes(name: str) -> None:
 
 
 @given(
-    st.integers(0, 232), sessions, st.integers(1, 10**6), st.sampled_from(list(Kind)[1:]), names, names, types, hashes
+    st.integers(0, 232),
+    sessions,
+    st.integers(1, 10**6),
+    st.sampled_from(list(TokenKind)[1:]),
+    names,
+    names,
+    types,
+    hashes,
 )
 def test_tokens_are_those_of_another_package(
-    domain_id: int, session: str, number: int, kind: Kind, node: str, name: str, type_name: str, type_hash: str
+    domain_id: int, session: str, number: int, kind: TokenKind, node: str, name: str, type_name: str, type_hash: str
 ) -> None:
     namespace, _, base = node.rpartition("/")
     theirs = NodeEntity(domain_id, session, 0, base, namespace or "/")
@@ -137,7 +147,7 @@ def test_tokens_are_those_of_another_package(
     endpoint = EndpointEntity(theirs, number, EntityKind(kind.value), name, dds_type(type_name), type_hash, USUAL)
     ours = token(domain_id, session, number, kind, node, name, type_name, type_hash, USUAL)
     assert ours == endpoint_liveliness_keyexpr(endpoint)
-    assert read_token(ours) == Seen(session, kind, node, name)
+    assert read_token(ours) == TokenContent(session, kind, node, name)
 
 
 def test_qualities_of_service_are_read_by_another_package() -> None:
@@ -147,7 +157,7 @@ def test_qualities_of_service_are_read_by_another_package() -> None:
 
 
 @pytest.mark.parametrize(("written", "seen"), TOKENS.items(), ids=[seen.kind.value for seen in TOKENS.values()])
-def test_what_a_later_version_adds_to_a_token_is_left_alone(written: str, seen: Seen) -> None:
+def test_what_a_later_version_adds_to_a_token_is_left_alone(written: str, seen: TokenContent) -> None:
     assert read_token(f"{written}/more") == seen
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.support.ros2_processes import Process, Router, raw_session
 from tests.support.waiting import wait_until
 from trade_gateway.ros.ros2 import Ros2
-from trade_gateway.ros.ros2._names import Kind, gid
+from trade_gateway.ros.ros2._names import TokenKind, gid
 
 pytestmark = pytest.mark.realtime
 
@@ -93,8 +93,8 @@ def come_and_go(graph: Ros2, router: Router, token: str) -> None:
     """An endpoint is seen, and its end."""
     presence = graph._node.presence
     with raw_session(router) as session, session.liveliness().declare_token(token):
-        wait_until(lambda: token in presence._seen, "it is seen")
-    wait_until(lambda: token not in presence._seen, "its end is seen")
+        wait_until(lambda: token in presence._tokens, "it is seen")
+    wait_until(lambda: token not in presence._tokens, "its end is seen")
 
 
 def test_S05_who_has_just_ended_keeps_its_name_for_a_while(
@@ -112,9 +112,9 @@ def test_S05_who_has_just_ended_keeps_its_name_for_a_while(
 def test_nothing_is_kept_of_withdrawn_endpoints(graph: Ros2, router: Router) -> None:
     presence = graph._node.presence
     come_and_go(graph, router, EARLY)
-    assert (Kind.PUBLISHER, "/said") not in presence._offered
-    assert not presence.offered(Kind.PUBLISHER, "/said")
-    assert (Kind.PUBLISHER, "/said") not in presence._offered  # nor by asking
+    assert (TokenKind.PUBLISHER, "/said") not in presence._offered
+    assert not presence.offered(TokenKind.PUBLISHER, "/said")
+    assert (TokenKind.PUBLISHER, "/said") not in presence._offered  # nor by asking
 
 
 def test_of_those_that_ended_only_the_last_ones_keep_their_names(

@@ -10,7 +10,7 @@ import zenoh
 from tests.support.ros2_processes import Router, raw_session
 from tests.support.waiting import wait_until
 from tests.unit.ros.ros2.fibonacci_action import ATTACHMENT, CDR, LONG_S, OTHER, key, numbers, pursue
-from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._graph import GoalEnd, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 
 pytestmark = pytest.mark.realtime
@@ -63,8 +63,10 @@ class RawServer:
         return [payload for asked, payload in self.asked if asked == part]
 
 
-@pytest.mark.parametrize(("status", "how"), [(4, Ended.SUCCEEDED), (5, Ended.CANCELED), (6, Ended.ABORTED)], ids=str)
-def test_the_action_client_uses_the_ros_wire_format(graph: Ros2, raw: zenoh.Session, status: int, how: Ended) -> None:
+@pytest.mark.parametrize(
+    ("status", "how"), [(4, GoalEnd.SUCCEEDED), (5, GoalEnd.CANCELED), (6, GoalEnd.ABORTED)], ids=str
+)
+def test_the_action_client_uses_the_ros_wire_format(graph: Ros2, raw: zenoh.Session, status: int, how: GoalEnd) -> None:
     server = RawServer(raw, "theirs", accepts=True, result=bytes([status, 0, 0, 0]) + numbers(1, 2, 3))
     feedback: list[Any] = []
     outcome = pursue(graph, "theirs", 3, feedback.append).wait(LONG_S)

@@ -12,7 +12,7 @@ from tests.support.ros2_processes import Process, Router, until_offered
 from tests.support.waiting import wait_until
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
-from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._names import TokenKind
 from trade_gateway.ros.ros2._services import Client
 
 pytestmark = pytest.mark.realtime
@@ -137,7 +137,7 @@ def test_of_two_servers_of_one_name_one_is_asked(graph: Ros2, router: Router, op
         server.serve("/twice", ADD, lambda _, who, _at, number=number: asked.append(who) or {"sum": number})
     both = open_graph(router, node="/watches")
     until_offered(graph, "/twice", ADD)
-    wait_until(lambda: both._node.presence._offered[Kind.SERVER, "/twice"] == 2, "both are there")
+    wait_until(lambda: both._node.presence._offered[TokenKind.SERVER, "/twice"] == 2, "both are there")
     for _ in range(5):
         call(graph, "/twice", {})
     assert len(asked) == 5

@@ -197,8 +197,8 @@ class Node:
         return type("Service", (), dict(parts, _type=head["type"], _md5sum=head["md5"]))
 
 
-def _filled(kind: Any, body: bytes) -> Any:
-    message = kind()
+def _filled(type_: Any, body: bytes) -> Any:
+    message = type_()
     message._buff = body
     return message
 

@@ -38,7 +38,7 @@ class Registrar:
         self._peers = peers
         self._healthy = healthy
         self._done: dict[Entry, Any] = {}
-        self._asked: dict[tuple[str, str], float] = {}
+        self._asked_s: dict[tuple[str, str], float] = {}
         self._turn = threading.Lock()
         self._wake = threading.Event()
         self._ended = False
@@ -130,13 +130,13 @@ class Registrar:
     def _connect(self, publishers: list[Any]) -> None:
         """Reconnects a broken connection whose ends are both alive: rospy waits for a change at the master."""
         now = time.monotonic()
-        self._asked = {key: when for key, when in self._asked.items() if now - when < _CONNECT_AGAIN_S}
+        self._asked_s = {key: when for key, when in self._asked_s.items() if now - when < _CONNECT_AGAIN_S}
         for topic, names in publishers:
             heard = get_topic_manager().get_subscriber_impl(topic)
             uris = [self._peers.uri(name) for name in names] if heard else []
-            lost = [uri for uri in uris if uri and not heard.has_connection(uri) and (topic, uri) not in self._asked]
+            lost = [uri for uri in uris if uri and not heard.has_connection(uri) and (topic, uri) not in self._asked_s]
             if lost:
-                self._asked.update({(topic, uri): now for uri in lost})
+                self._asked_s.update({(topic, uri): now for uri in lost})
                 self._handler.reg_man.publisher_update(topic, lost)
 
 

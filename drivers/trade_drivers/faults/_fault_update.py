@@ -11,7 +11,7 @@ BUS_GONE: Final = "bus gone"
 Respect = Literal["fault", "link"]
 
 
-class Trouble(NamedTuple):
+class FaultUpdate(NamedTuple):
     """The faults of a device in one respect from now on; replaces the previous ones."""
 
     device: str
@@ -21,11 +21,11 @@ class Trouble(NamedTuple):
     """Seconds since the epoch."""
     at_s: float
     """``time.monotonic()``."""
-    found: "tuple[Found, ...]" = ()
+    found: "tuple[DetectedFault, ...]" = ()
     """All current faults in this respect; empty if there are none."""
 
 
-class Found(NamedTuple):
+class DetectedFault(NamedTuple):
     """One fault."""
 
     kind: str
@@ -33,19 +33,19 @@ class Found(NamedTuple):
     remedy: str = ""
 
 
-Tell = Callable[[Trouble], object]
+Tell = Callable[[FaultUpdate], object]
 """Accepts a change; never waits."""
 
 
-def found_in(device: str, error: Exception) -> tuple[Found, ...]:
+def found_in(device: str, error: Exception) -> tuple[DetectedFault, ...]:
     """Returns the faults of a device that an error describes."""
     match error:
         case DeviceFault():
             parts = parts_of(error.fault)
-            return tuple(Found(kind_of(part), f"{device}: {part}", error.remedy) for part in parts)
+            return tuple(DetectedFault(kind_of(part), f"{device}: {part}", error.remedy) for part in parts)
         case BusGone():
-            return (Found(BUS_GONE, str(error)),)
+            return (DetectedFault(BUS_GONE, str(error)),)
         case DeviceError():
-            return (Found(SILENT, str(error)),)
+            return (DetectedFault(SILENT, str(error)),)
         case _:  # a bug in the driver
-            return (Found(type(error).__name__, f"{device}: its state cannot be read: {error!r}"),)
+            return (DetectedFault(type(error).__name__, f"{device}: its state cannot be read: {error!r}"),)
