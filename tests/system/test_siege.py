@@ -51,6 +51,8 @@ def test_nothing_moves_that_must_not_whatever_faults_occur(besieged: Stand) -> N
     if verdict.violations:  # the notes of all processes are the evidence
         shutil.rmtree(KEPT, ignore_errors=True)
         shutil.copytree(besieged.records, KEPT)
+        for said in besieged.site.folder.glob("*complaints"):  # of the gateway and the drivers
+            shutil.copy(said, KEPT)
         for name, entries in logs.items():
             (KEPT / f"{name}.log.json").write_bytes(msgspec.json.encode(entries))
     assert not verdict.violations, "\n".join([*verdict.violations, f"the notes of all are kept in {KEPT}"])

@@ -32,7 +32,7 @@ Way = tuple[RuleMark, ...]
 """The causes of a firing, the first one first; it ends with the firing itself."""
 
 
-class RunFiring:
+class FiringProgress:
     """A firing that is running or over."""
 
     def __init__(self, way: Way) -> None:
@@ -45,11 +45,11 @@ class LoopDetector:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._past: deque[RunFiring] = deque(maxlen=_MOST)
+        self._past: deque[FiringProgress] = deque(maxlen=_MOST)
 
-    def begin(self, way: Way) -> RunFiring:
+    def begin(self, way: Way) -> FiringProgress:
         """A rule fires; the caller sets ``ended_ns`` at its end."""
-        past = RunFiring(way)
+        past = FiringProgress(way)
         with self._lock:
             self._past.append(past)
         return past
