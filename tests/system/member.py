@@ -116,6 +116,11 @@ class Member:
         )
         return self.container.reach._links._main_endpoint()
 
+    def reopen(self, *connect: str) -> None:
+        """Close its container, and start the next one of the same name, as a gateway does for another policy."""
+        self.up.close()
+        self.start(*connect)
+
     def find_each_other(self) -> None:
         self.up.system.set_broadcast(True)
         self.up.system.set_discovery(True)

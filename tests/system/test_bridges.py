@@ -154,6 +154,28 @@ def test_private_networks_dial_out_and_messages_cross_two_bridges_in_a_row(
     all_work_together([robot, arm, desk, laptop, guest, single])
 
 
+def test_S12_a_bridge_further_away_that_opens_again_ends_no_lock(networks: Networks, member: StartMember) -> None:
+    """The container that granted it keeps its own bridge, and loses sight of the owner's only."""
+    networks.lay("private", robot="10.231.1.1", arm="10.231.1.2")
+    networks.lay("public", robot="10.231.2.1", office="10.231.2.2")
+    networks.lay("inner", office="10.231.3.1", desk="10.231.3.2")
+    office = member("office", "office", "10.231.2.2:7450,10.231.3.1:7450", bridge="public,inner")
+    office.ask("start")
+    robot = member("robot", "robot", "10.231.1.1:7450", bridge="private")
+    robot.ask("start", "tcp/10.231.2.2:7450")
+    arm = member("arm", "arm", "10.231.1.2:0")
+    arm.ask("start", "tcp/10.231.1.1:7450")
+    arm.ask("register_one", "rosie.arm.p0")
+    desk = member("desk", "desk", "10.231.3.2:0")
+    desk.ask("start", "tcp/10.231.3.1:7450")
+    desk.ask("group", "rosie.arm.p0", "arm")
+    desk.ask("hold", "rosie.arm.p0")
+    for _ in range(3):
+        office.ask("reopen")
+        desk.ask("group", "rosie.arm.p0", "arm")
+        assert desk.ask("held")
+
+
 def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMember, two_networks: None) -> None:
     bridge = up(member("between", "bridge", BRIDGE, bridge="net1,net2"))
     left = up(member("left1", "l1", "10.231.1.2:0"))

@@ -69,7 +69,7 @@ from trade._threads.scheduler import Scheduler
 from trade._tracing.api import TraceApi
 from trade.errors import AccessDenied, ConfigurationError, TradeError
 from trade.protocol.container_info import ContainerInfo
-from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
+from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey, bridge_key
 from trade.protocol.messages import Token
 from trade.stop_line import RelayedEstop, StopApi, StopLines, StopLineService
 from trade.transport.base import Transport
@@ -382,6 +382,8 @@ class Components:
             self.providers.add(estops, (DOMAIN,), name=ESTOP_PROVIDER)
             self.estop.begin(estops, self.stop_lines.estop, partial(RelayedEstop, self.client))
             self._leaving.callback(self.announcer.appear().close)
+            if self._links is not None and self._links.bridges:
+                self._leaving.callback(self.transport.appear(bridge_key(self._address)).close)
             self.watch = RegistryListener(
                 self.transport,
                 self.registry,

@@ -1,8 +1,11 @@
 """Grace periods for sessions out of sight because a bridge was lost: they count as alive, as bridges come back (S12).
 
-A sign of life may disappear a moment before the loss of its link is visible, so the loss is checked twice.
+A sign of life may disappear a moment before the loss of its link is visible, so the loss is checked twice. A bridge
+that leaves closes its links one after the other: its neighbours lose sight of each other before they lose the bridge.
+So its own sign as a bridge, which disappears first, begins a time in which it counts as lost, as does one far away.
 """
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Final
@@ -11,6 +14,8 @@ from trade._threads.scheduler import NEVER, Scheduler
 
 GRACE_S: Final = 1.0
 _LOOK_S: Final = 0.05
+_LEAVING_S: Final = 2.0
+"""How long a bridge takes to close its links, at most."""
 _END_S: Final = 2.0
 
 
@@ -41,6 +46,7 @@ class GracePeriods:
         self._clock = timers.clock
         self._due: dict[str, tuple[float, bool]] = {}
         """When to check a session, in seconds of the clock, and whether it is gone then."""
+        self._bridge_left_s = -math.inf
         self._guard = threading.Lock()
         self._reporting = threading.Lock()
         """Held while a session's end is reported: a session that returns just then waits, and counts as a new one."""
@@ -51,6 +57,10 @@ class GracePeriods:
         with self._guard:
             at, _ = self._due.setdefault(session, (self._clock.now() + self._look_s, False))
         self._checks.by(at * 1e9)
+
+    def bridge_left(self) -> None:
+        """A bridge's sign of life as a bridge disappeared: what disappears next may only be out of sight."""
+        self._bridge_left_s = self._clock.now()
 
     def end(self, session: str) -> bool:
         """A session's sign of life reappeared; returns whether its period was running.
@@ -82,7 +92,7 @@ class GracePeriods:
                 at, last = self._due[first]
                 if at > self._clock.now():
                     break
-                if last or not self._bridge_lost():
+                if last or not (self._bridge_lost() or self._clock.now() < self._bridge_left_s + _LEAVING_S):
                     return first
                 self._due[first] = (at + self._grace_s - self._look_s, True)
             return None

@@ -12,7 +12,7 @@ from trade._discovery.resync import Resynchronizer
 from trade._registry.registry import ContainerState, Registry
 from trade._threads.scheduler import Scheduler
 from trade.protocol.estop_messages import decode_open_estops
-from trade.protocol.keys import ALIVE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
+from trade.protocol.keys import ALIVE, BRIDGE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
 from trade.protocol.messages import (
     PROTOCOL,
     Estop,
@@ -135,6 +135,10 @@ class RegistryListener:
             return
         address = Address(identity, container, epoch)
         if address == self._own:
+            return
+        if client == [BRIDGE]:
+            if message.payload is None:
+                self._absences.bridge_left()
             return
         session = "/".join((str(address), *client))
         bridged = self._transport.bridged()

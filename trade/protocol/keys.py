@@ -83,6 +83,15 @@ def alive_key(session: Address | str) -> str:
     return f"alive/{session}"
 
 
+BRIDGE: Final = "bridge"
+"""The last chunk of a bridge's second sign of life; the sessions of clients have a dot in theirs."""
+
+
+def bridge_key(address: Address) -> str:
+    """The key of the sign of life that a bridge has as a bridge; the first to disappear when it leaves."""
+    return alive_key(f"{address}/{BRIDGE}")
+
+
 def estop_key(identity: str) -> str:
     """The key of e-stop orders of an identity, to which all containers subscribe."""
     return f"estop/{identity}"

@@ -31,6 +31,13 @@ def absences(reported: "queue.SimpleQueue[str]", timers: Scheduler) -> Iterator[
     made.close()
 
 
+def after(timers: Scheduler, seconds: float) -> None:
+    """Return once so much time of the timers has passed."""
+    later = threading.Event()
+    timers.begin(later.set, timers.clock.now_ns() + int(seconds * 1e9))
+    assert later.wait(60)
+
+
 def test_S12_a_container_that_does_not_come_back_is_reported_gone_once(
     absences: GracePeriods, reported: "queue.SimpleQueue[str]"
 ) -> None:
@@ -62,15 +69,28 @@ def test_a_container_lost_without_any_bridge_is_gone_as_soon_as_that_is_certain(
     absences.close()
 
 
+def test_S12_what_disappears_after_a_bridge_as_such_may_be_out_of_sight_only(
+    reported: "queue.SimpleQueue[str]", timers: Scheduler
+) -> None:
+    """It closes one link after the other, and this container's may be its last."""
+    absences = GracePeriods(reported.put, lambda: False, timers, grace_s=3600.0)
+    absences.bridge_left()
+    absences.begin("me/arm/1")
+    after(timers, 3.0)
+    absences.begin("me/leg/1")
+    assert reported.get(timeout=60) == "me/leg/1", "it disappeared later, so nothing speaks for it"
+    assert absences.end("me/arm/1")
+    absences.close()
+    assert reported.empty()
+
+
 def test_closed_grace_periods_report_no_absence(
     absences: GracePeriods, reported: "queue.SimpleQueue[str]", timers: Scheduler
 ) -> None:
     absences.begin("me/arm/1")
     absences.close()
     absences.begin("me/leg/1")
-    later = threading.Event()
-    timers.begin(later.set, timers.clock.now_ns() + 1_000_000_000)
-    assert later.wait(60)
+    after(timers, 1.0)
     assert reported.empty()
 
 
