@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench._links import Link
+from tests.bench._messages import TypedMessages, answer
 from tests.bench._peers import BarePair, bare_link, serve_bare
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
 from tests.bench._trade import Trade, provider
@@ -68,8 +69,12 @@ class TradeAcross(Trade):
 class BareAcross(BarePair):
     """What our calls through a gateway stand on: zenoh alone, and a router with the same regions."""
 
-    def __init__(self, site: Site, name: str, port: int, *, tls: bool = False, rules: bool = False) -> None:
+    def __init__(
+        self, site: Site, name: str, port: int, *, tls: bool = False, rules: bool = False, typed: bool = False
+    ) -> None:
+        """With ``typed``, what it carries are the two messages of a call, encoded and decoded at both ends."""
         self.name = name
+        self._typed = typed
         self.server_at, self.caller_at, self.router_at = site.host("robot"), site.host("office"), site.host("door")
         self._protocol = "tls" if tls else "tcp"
         self._own = f"{self._protocol}/127.0.0.1:{port}"
@@ -80,13 +85,14 @@ class BareAcross(BarePair):
     @contextmanager
     def serve(self) -> Iterator[str]:
         with self._session("robot", connect=self._endpoints[:1]) as session:
-            serve_bare(session, _CALLS, _REPLIES)
+            serve_bare(session, _CALLS, _REPLIES, answer if self._typed else bytes)
             yield ""
 
     @contextmanager
     def connect(self, address: str) -> Iterator[Link]:
         with self._session("planner", connect=self._endpoints[1:]) as session:
-            yield bare_link(session, _CALLS, _REPLIES)
+            link = bare_link(session, _CALLS, _REPLIES)
+            yield TypedMessages(link) if self._typed else link
 
     def route(self, pipe: Connection) -> None:
         """Be the router until the pipe ends."""

@@ -48,6 +48,7 @@ class Running:
 
     def __init__(self, peer: Peer, server: Connection, caller: Connection) -> None:
         self.name = peer.name
+        self.least_bytes = peer.least_bytes
         self.most_bytes = peer.most_bytes
         self._server = server
         self._caller = caller
@@ -127,6 +128,8 @@ def child(main, *args: object, inside: str = "") -> Iterator[Connection]:
 def _run(inside: str, main, *args: object) -> None:
     if inside:
         _enter(Path("/run/netns") / inside)
+        # Another host has another folder: calls between the two would take the local path else.
+        os.environ["TRADE_RUNTIME_DIR"] = str(Path(os.environ["TRADE_RUNTIME_DIR"]) / inside)
     main(*args)
 
 

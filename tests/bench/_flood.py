@@ -19,7 +19,7 @@ from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
 
 RATE_HZ: Final = 50_000
 _TICK_S: Final = 0.001
-_MOST_TIMES_P99, _MOST_STOP_MS = 20.0, 50.0
+_MOST_TIMES_P99, _MOST_CALL_MS, _MOST_STOP_MS = 20.0, 250.0, 50.0
 _PATIENCE_S: Final = 2.0
 _DRAINED_S: Final = 30.0
 _ROUND_S: Final = 5.0
@@ -260,8 +260,14 @@ def _print(results: Mapping[str, Sequence[Felt]], n: int) -> None:
     quiet = results[_QUIET]
     for flood in FLOODS:
         felt = results[flood.name]
-        x = [_at(99, one.call_ms) / _at(99, other.call_ms) for one, other in zip(felt, quiet, strict=True)]
-        print_target(f"{flood.name}: call p99 / none", x, f"below {_MOST_TIMES_P99:.0f}", lambda x: x < _MOST_TIMES_P99)
+        if flood.kind == "stop":  # calls come after stops everywhere, but in time for a lock to be renewed
+            p99_ms = [_at(99, one.call_ms) for one in felt]
+            limit = f"below {_MOST_CALL_MS:.0f}"
+            print_target(f"{flood.name}: call p99, ms", p99_ms, limit, lambda ms: ms < _MOST_CALL_MS)
+        else:
+            x = [_at(99, one.call_ms) / _at(99, other.call_ms) for one, other in zip(felt, quiet, strict=True)]
+            limit = f"below {_MOST_TIMES_P99:.0f}"
+            print_target(f"{flood.name}: call p99 / none", x, limit, lambda x: x < _MOST_TIMES_P99)
         most = [max(one.stop_ms) for one in felt]
         print_target(f"{flood.name}: stop, ms", most, f"below {_MOST_STOP_MS:.0f}", lambda ms: ms < _MOST_STOP_MS)
 

@@ -12,16 +12,18 @@ from tests.bench import _flood, _idle
 from tests.bench._across import BareAcross, TradeAcross
 from tests.bench._calls import CPU, P50, Results, measure, print_latency, print_rate, ratios, up, worth
 from tests.bench._children import Job, Running, child, hear
+from tests.bench._places import own_folder
 from tests.bench._report import print_target
 from tests.bench._site import PLAIN, SECURE, Site, site
 
 _SIZE: Final = 64
 _LARGE_SIZE, _LARGE_SHARE = 2 * 1024 * 1024, 0.05
 _IN_FLIGHT: Final = 32
-_MOST_OF_DIRECT, _MOST_OF_BARE, _MOST_OF_DIRECT_TWO, _LEAST_RATE = 2.0, 1.2, 3.0, 5000
+_MOST_OF_DIRECT, _MOST_OF_MESSAGES, _MOST_OF_DIRECT_TWO, _LEAST_RATE = 2.0, 1.5, 3.0, 5000
 
 _DIRECT, _ONE, _TWO = "TRADE, direct", "TRADE, one gateway", "TRADE, two gateways"
 _BARE, _BARE_TLS, _BARE_RULES = "bare pair, plain", "bare pair, TLS", "bare pair, rules"
+_MESSAGES, _MESSAGES_TLS = "bare messages, plain", "bare messages, TLS"
 _DIRECT_PLAIN, _ONE_PLAIN = "TRADE, direct, plain", "TRADE, one, plain"
 
 
@@ -33,7 +35,7 @@ def run(n: int, rounds: int, idle_s: float) -> None:
         rounds: turns of each pair; a quarter as many of each flood.
         idle_s: how long the idle gateway is looked at.
     """
-    with site() as where:
+    with own_folder(), site() as where:
         if where is not None:
             door = where.begin_gateway("door", SECURE)
             _idle.run(where, door, idle_s)
@@ -64,6 +66,8 @@ def _up(site: Site) -> Iterator[Sequence[Running]]:
         BareAcross(site, _BARE, 7471),
         BareAcross(site, _BARE_TLS, 7472, tls=True),
         BareAcross(site, _BARE_RULES, 7473, tls=True, rules=True),
+        BareAcross(site, _MESSAGES, 7474, typed=True),
+        BareAcross(site, _MESSAGES_TLS, 7475, tls=True, typed=True),
     )
     ours = (
         TradeAcross(site, _DIRECT_PLAIN, "aside", PLAIN),
@@ -96,8 +100,8 @@ def _print_costs(results: Results) -> None:
         print(f"{what:32} {x[0]:5.2f} x the p50, {x[1]:.2f} x the CPU of the ends")
     for what, one, other, most in (
         ("one gateway: p50 / direct", _ONE, _DIRECT, _MOST_OF_DIRECT),
-        ("one gateway: p50 / bare pair", _ONE, _BARE_TLS, _MOST_OF_BARE),
-        ("one, plain: p50 / bare, plain", _ONE_PLAIN, _BARE, _MOST_OF_BARE),
+        ("one gateway: p50 / bare messages", _ONE, _MESSAGES_TLS, _MOST_OF_MESSAGES),
+        ("one, plain: p50 / bare messages, plain", _ONE_PLAIN, _MESSAGES, _MOST_OF_MESSAGES),
         ("two gateways: p50 / direct", _TWO, _DIRECT, _MOST_OF_DIRECT_TWO),
     ):
         x = ratios(results[one], results[other], *P50)

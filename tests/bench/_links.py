@@ -32,6 +32,8 @@ class Peer(ABC):
     """The module without which it cannot run."""
     most_bytes = 1 << 30
     """Larger calls of it are left out, because they would take minutes."""
+    least_bytes = 0
+    """Smaller calls of it are left out, because others show more."""
     python = ""
     """Another Python that both ends run under."""
     server_at = caller_at = ""

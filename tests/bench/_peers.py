@@ -11,7 +11,7 @@ from typing import Any
 
 from tests.bench._links import Link, Peer, Pipeline
 
-_SIZE_BYTES = 4
+_SIZE_BYTES, _ID_BYTES = 4, 8
 _PATIENCE_S = 20.0
 _CALLS, _REPLIES = "call/bench", "reply/bench"
 _MOST_UNREAD = 256 * 1024
@@ -85,22 +85,24 @@ class BarePair(Peer):
             yield bare_link(session, _CALLS, _REPLIES)
 
 
-class _BareLink(Pipeline):
+class BareLink(Pipeline):
+    """Messages with ids before them."""
+
     def __init__(self, put: Callable[[bytes], Any], receive: Callable[[], Any]) -> None:
         self._put = put
         self._receive = receive
         self._ids = itertools.count(1)
 
     def begin(self, payload: bytes) -> bytes:
-        call_id = next(self._ids).to_bytes(8, "little")
+        call_id = next(self._ids).to_bytes(_ID_BYTES, "little")
         self._put(call_id + payload)
         return call_id
 
     def end(self, begun: bytes) -> bytes:
         while True:
             answer = self._receive().payload.to_bytes()
-            if answer[:8] == begun:
-                return answer[8:]
+            if answer[:_ID_BYTES] == begun:
+                return answer[_ID_BYTES:]
 
 
 class BareQuery(BarePair):
@@ -149,17 +151,20 @@ def _reply_all(queryable) -> None:
         return
 
 
-def serve_bare(session, calls: str, replies: str) -> None:
+Answer = Callable[[bytes], bytes]
+
+
+def serve_bare(session, calls: str, replies: str, answer: Answer = bytes) -> None:
     """Answer what comes on one key on another one, until the session closes."""
     heard, answers = session.declare_subscriber(calls, _fifo()), _declare(session, replies)
-    threading.Thread(target=_answer_all, args=(heard, answers), daemon=True).start()
+    threading.Thread(target=_answer_all, args=(heard, answers, answer), daemon=True).start()
 
 
-def bare_link(session, calls: str, replies: str) -> Link:
+def bare_link(session, calls: str, replies: str) -> "BareLink":
     """The caller's end; raises RuntimeError if no server receives its calls."""
     heard, asked = session.declare_subscriber(replies, _fifo()), _declare(session, calls)
     _wait_until_heard(asked)
-    return _BareLink(asked.put, heard.recv)
+    return BareLink(asked.put, heard.recv)
 
 
 def _wait_until_heard(asked) -> None:
@@ -170,13 +175,14 @@ def _wait_until_heard(asked) -> None:
         threading.Event().wait(0.01)
 
 
-def _answer_all(calls, replies) -> None:
+def _answer_all(calls, replies, answer: Answer) -> None:
     import zenoh
 
     receive, put = calls.handler.recv, replies.put
     try:
         while True:
-            put(receive().payload.to_bytes())
+            message = receive().payload.to_bytes()
+            put(message[:_ID_BYTES] + answer(message[_ID_BYTES:]))
     except zenoh.ZError:  # closed
         return
 

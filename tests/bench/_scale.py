@@ -20,6 +20,8 @@ from tests.bench._offering import PROVIDERS, SERVICES, fill, kind_of_arm
 from tests.bench._report import print_target
 
 SIZES: Final = (10, 30, 100, 300, 1000)
+_MOST_ANSWERED: Final = 300
+"""Of more containers than these, one process cannot answer for all before the one that joins repeats its query."""
 _ALL_WHOLE: Final = 30
 """Up to so many all are whole containers; beyond, three."""
 _FINDS, _LOCKS = 200, 20
@@ -109,9 +111,15 @@ def _reported(cost: Cost | None) -> str:
 
 def _print_targets(seen: Sequence[Seen]) -> None:
     least, most = seen[0], seen[-1]
-    bytes_each = [one.join.bytes / one.containers for one in (least, most)]
+    one_answers = max((one for one in seen if one.containers <= _MOST_ANSWERED), key=lambda one: one.containers)
+    bytes_each = [one.join.bytes / one.containers for one in (least, one_answers)]
     finds, locks = most.find_us / least.find_us, most.lock_us / least.lock_us
-    print_target("join, bytes each: most / least", [bytes_each[1] / bytes_each[0]], "at most 1.2", lambda x: x <= 1.2)
+    print_target(
+        f"join, bytes each: {one_answers.containers} / {least.containers}",
+        [bytes_each[1] / bytes_each[0]],
+        "at most 1.2",
+        lambda x: x <= 1.2,
+    )
     print_target("remote service: KiB of Python", [most.kib_a_service], "at most 2", lambda kib: kib <= 2)
     print_target("find: most / least", [finds], "at most 2", lambda ratio: ratio <= 2)
     print_target("lock: most / least", [locks], "at most 2", lambda ratio: ratio <= 2)

@@ -1,11 +1,12 @@
 """docs/performance.md and its pictures, from the run in docs/performance.json: ``python -m tests.bench.page``.
 
-Nothing on that page is written by hand but the reasons for missed targets, which stand in why.toml beside this module.
+Nothing on that page is written by hand but what is in why.toml beside this module: the reasons for missed targets,
+and the bounds that replaced some.
 """
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Final
@@ -92,13 +93,34 @@ class Reason(Struct, frozen=True, forbid_unknown_fields=True):
     tried: str
 
 
-def read_reasons(file: Path = _WHY) -> dict[str, Reason]:
-    """By the name of each target that one is for."""
-    read = convert(tomllib.loads(file.read_text()), dict[str, list[Reason]])
-    return {name: reason for reason in read.get("reason", []) for name in reason.targets}
+class Bound(Struct, frozen=True, forbid_unknown_fields=True):
+    """A bound that was found, and that took the place of targets."""
+
+    asked: tuple[str, ...]
+    """Those targets."""
+    targets: tuple[str, ...]
+    """By name, the ones that replaced them."""
+    why: str
 
 
-def written(run: Run, reasons: Mapping[str, Reason]) -> str:
+class Why(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is written by hand."""
+
+    reason: tuple[Reason, ...] = ()
+    bound: tuple[Bound, ...] = ()
+
+    @property
+    def reasons(self) -> dict[str, Reason]:
+        """By the name of each target that one is for."""
+        return {name: reason for reason in self.reason for name in reason.targets}
+
+
+def read_why(file: Path = _WHY) -> Why:
+    """What is written by hand."""
+    return convert(tomllib.loads(file.read_text()), Why)
+
+
+def written(run: Run, why: Why) -> str:
     """The page."""
     head = _HEAD.format(
         about=about(run),
@@ -106,7 +128,7 @@ def written(run: Run, reasons: Mapping[str, Reason]) -> str:
         command=" ".join(["python -m tests.bench", *run.arguments]),
         versions=", ".join(f"{name} {version}" for name, version in run.versions.items()),
     )
-    return "\n".join([head.rstrip(), *_again(run), *_targets(run, reasons), *_measured(run), *_skipped(run)]) + "\n"
+    return "\n".join([head.rstrip(), *_again(run), *_targets(run, why), *_measured(run), *_skipped(run)]) + "\n"
 
 
 def _again(run: Run) -> Iterator[str]:
@@ -117,11 +139,18 @@ def _again(run: Run) -> Iterator[str]:
         yield f"  other programs took {others} of the machine: `{command}`."
 
 
-def _targets(run: Run, reasons: Mapping[str, Reason]) -> Iterator[str]:
+def _targets(run: Run, why: Why) -> Iterator[str]:
     yield f"\n## Targets: {len(run.targets) - len(run.missed)} met, {len(run.missed)} missed\n"
     yield from _table(("part", "target", "asked", "measured", ""), map(_row, run.targets))
+    measured = {target.name: with_spread(target.measured) for target in run.targets}
+    if bounds := [bound for bound in why.bound if measured.keys() & set(bound.targets)]:
+        yield "\n### Targets that a bound replaced"
+    for bound in bounds:
+        yield f"\n**Asked: {'; '.join(bound.asked)}. Now: {'; '.join(bound.targets)}**\n"
+        yield bound.why.strip()
     if not run.missed:
         return
+    reasons = why.reasons
     yield "\n### Missed, and why"
     for reason in dict.fromkeys(reasons.get(target.name) for target in run.missed):
         names = [target.name for target in run.missed if reasons.get(target.name) == reason]
@@ -171,10 +200,10 @@ def _table(head: Sequence[str], rows: Iterator[tuple[str, ...]]) -> Iterator[str
         yield f"| {' | '.join(row)} |"
 
 
-def files(run: Run, reasons: Mapping[str, Reason]) -> dict[str, str]:
+def files(run: Run, why: Why) -> dict[str, str]:
     """What belongs into docs/, by path."""
     drawn = {f"pictures/performance-{name}.svg": picture for name, picture in pictures(run).items()}
-    return {"performance.md": written(run, reasons), **drawn}
+    return {"performance.md": written(run, why), **drawn}
 
 
 def main() -> None:
@@ -184,15 +213,17 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=DOCS / "performance.json", help="the run; default %(default)s")
     parser.add_argument("--to", type=Path, default=DOCS, help="the folder to write to; default %(default)s")
     options = parser.parse_args()
-    run, reasons = Run.read(options.json), read_reasons()
-    for name, text in files(run, reasons).items():
+    run, why = Run.read(options.json), read_why()
+    reasons = why.reasons
+    for name, text in files(run, why).items():
         (options.to / name).parent.mkdir(parents=True, exist_ok=True)
         (options.to / name).write_text(text)
         print(f"wrote {options.to / name}")
     for target in run.missed:
         if target.name not in reasons:
             print(f"missed without an explanation in {_WHY.name}: {target.name}")
-    for name in reasons.keys() - {target.name for target in run.targets}:
+    explained = reasons.keys() | {name for bound in why.bound for name in bound.targets}
+    for name in sorted(explained - {target.name for target in run.targets}):
         print(f"explained in {_WHY.name}, and not in this run: {name}")
 
 

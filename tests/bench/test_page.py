@@ -10,7 +10,7 @@ from tests.bench import page
 from tests.bench._plots import figure
 from tests.bench._plots import page as html
 from tests.bench._record import NEVER, Machine, Point, Run, Skipped, Spread, Target
-from tests.bench.page import DOCS, Reason, files, read_reasons
+from tests.bench.page import DOCS, Bound, Reason, Why, files, read_why
 
 FAST, SLOW = Spread.of([9.0, 10.0, 11.0]), Spread.of([123.0, 456.0, 789.0])
 
@@ -46,15 +46,12 @@ def a_run(**changes: object) -> Run:
     return run
 
 
-REASONS = dict.fromkeys(
-    ("64 B: p50 / rpyc", "64 B: p50 / Pyro5"),
-    Reason(("64 B: p50 / rpyc", "64 B: p50 / Pyro5"), "Six threads wake up for a call.", "One thread less."),
-)
+WHY = Why((Reason(("64 B: p50 / rpyc", "64 B: p50 / Pyro5"), "Six threads wake up for a call.", "One thread less."),))
 
 
 def test_the_page_has_every_target_every_figure_and_what_was_not_measured() -> None:
     run = a_run()
-    text = page.written(run, REASONS)
+    text = page.written(run, WHY)
     for target in run.targets:
         [row] = [line for line in text.splitlines() if line.startswith(f"| {target.part} | {target.name} |")]
         assert row.endswith("| met |" if target.met else "| **missed** |")
@@ -69,7 +66,7 @@ def test_the_page_has_every_target_every_figure_and_what_was_not_measured() -> N
 
 
 def test_targets_missed_for_one_reason_are_listed_together_and_those_without_one_are_marked() -> None:
-    text = page.written(a_run(), REASONS)
+    text = page.written(a_run(), WHY)
     _, _, missed = text.partition("### Missed, and why")
     missed, _, _ = missed.partition("\n## ")
     assert missed.count("Six threads wake up for a call.\n\nTried: One thread less.") == 1
@@ -78,15 +75,25 @@ def test_targets_missed_for_one_reason_are_listed_together_and_those_without_one
     assert "bare pair" not in missed
 
 
+def test_a_bound_names_the_targets_that_it_replaced_where_its_own_were_measured() -> None:
+    here = Bound(("64 B: p50 / raw TCP at most 1.4",), ("64 B: p50 / bare pair",), "Nothing is faster.")
+    elsewhere = Bound(("2 MiB",), ("not in this run",), "Nothing.")
+    text = page.written(a_run(), Why(bound=(here, elsewhere)))
+    _, _, bounds = text.partition("### Targets that a bound replaced\n\n")
+    bounds, _, _ = bounds.partition("\n### ")
+    now = "**Asked: 64 B: p50 / raw TCP at most 1.4. Now: 64 B: p50 / bare pair**"
+    assert bounds == f"{now}\n\nNothing is faster.\n"
+
+
 @pytest.mark.parametrize(
     ("others_cores", "said"), [(0.02, "was quiet"), (0.8, "**not quiet**"), (None, "unknown part")]
 )
 def test_the_page_says_whether_other_programs_ran(others_cores: float | None, said: str) -> None:
-    assert said in page.written(a_run(others_cores=others_cores), {})
+    assert said in page.written(a_run(others_cores=others_cores), Why())
 
 
 def test_pictures_show_every_point_in_order_and_stay_within_their_frame() -> None:
-    drawn = files(a_run(), {})["pictures/performance-calls.svg"]
+    drawn = files(a_run(), Why())["pictures/performance-calls.svg"]
     root = ET.fromstring(drawn)
     _, _, width, height = (float(one) for one in root.attrib["viewBox"].split())
     dots = [(float(one.attrib["cx"]), one.attrib["r"]) for one in root.iter("{http://www.w3.org/2000/svg}circle")]
@@ -108,7 +115,7 @@ def test_the_page_of_plots_has_all_parts_and_needs_nothing_from_elsewhere() -> N
 
 def test_the_page_in_docs_is_what_the_run_beside_it_gives() -> None:
     run = Run.read(DOCS / "performance.json")
-    for name, text in files(run, read_reasons()).items():
+    for name, text in files(run, read_why()).items():
         assert (DOCS / name).read_text() == text, f"{name}: make bench-page"
 
 
@@ -125,10 +132,10 @@ def test_the_command_writes_the_page_and_names_missed_targets_without_a_reason(
 ) -> None:
     a_run().write(tmp_path / "run.json")
     monkeypatch.setattr("sys.argv", ["page", "--json", str(tmp_path / "run.json"), "--to", str(tmp_path)])
-    reasons = REASONS | {"64 B: p50 / Viam SDK": REASONS["64 B: p50 / rpyc"]}
-    monkeypatch.setattr(page, "read_reasons", lambda: reasons)
+    why = Why((*WHY.reason, Reason(("64 B: p50 / Viam SDK",), "It is slow.", "Nothing.")))
+    monkeypatch.setattr(page, "read_why", lambda: why)
     page.main()
-    assert (tmp_path / "performance.md").read_text() == page.written(a_run(), reasons)
+    assert (tmp_path / "performance.md").read_text() == page.written(a_run(), why)
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "missed without an explanation in why.toml: late at 500 Hz, 1 TPDO, %",
         "explained in why.toml, and not in this run: 64 B: p50 / Viam SDK",
@@ -150,7 +157,7 @@ def test_parts_measured_again_replace_the_earlier_ones_and_the_page_says_so() ->
     assert [one for one in both.points if one.part == "can"] == newer_run.points
     assert [one.met for one in both.targets] == [True, False, False, True]
     assert Skipped("servo", "servo", "it failed") in both.skipped
-    text = files(both, {})["performance.md"]
+    text = files(both, Why())["performance.md"]
     assert "**Measured again**: can, servo; 2026-11-22 10:00 UTC, commit fedcba, while" in text
     once_more = both.amended(
         a_run(arguments=["servo"], points=[], targets=[], skipped=[Skipped("servo", "servo", "x")])

@@ -23,7 +23,8 @@ _logger = logging.getLogger("trade")
 
 MARK: Final = ".calls-"
 """The first part of the names of sockets for calls."""
-_MOST_FREE: Final = 8
+_MOST_FREE: Final = 32
+"""Free connections that are kept. A program with as many threads that call opens no new one for each call."""
 _GREETING_S: Final = 0.5
 _SENDING_S: Final = 1.0
 """How long a call waits for the one before it to be sent."""

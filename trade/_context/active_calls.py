@@ -3,7 +3,9 @@
 import logging
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from heapq import heappop, heappush
 from typing import Any, Final
 
@@ -119,7 +121,8 @@ class CallDeduplicator:
         self._calls: dict[Key, ActiveCall] = {}
         self._until: list[tuple[int, Key]] = []
         """A heap of times from which kept calls may be forgotten."""
-        self._bodies: dict[Key, ActiveCall] = {}
+        self._bodies: OrderedDict[Key, ActiveCall] = OrderedDict()
+        """The oldest first, which is found at once however many came before it."""
         self._bytes = 0
         self._evicted: dict[Key, int] = {}
         """Caller and upper bits of its ids -> the highest id that was evicted early; ids count upwards."""
@@ -181,7 +184,7 @@ class CallDeduplicator:
         self._bytes += size
         self._bodies[key] = ongoing
         while self._bytes > MOST_BYTES:
-            oldest = self._bodies.pop(next(iter(self._bodies)))
+            _, oldest = self._bodies.popitem(last=False)
             self._bytes -= oldest.size
             oldest.answer = _unknown(service)
 
@@ -207,7 +210,9 @@ def _is_for(call: Call | None, session: str) -> bool:
     return call is not None and any(within(one, session) for one in (call.session, *behalf))
 
 
+@lru_cache(maxsize=256)
 def _unknown(service: str) -> Answer:
+    """Made once: a large answer may take the place of a thousand small ones."""
     return failed(OutcomeUnknown(service=service, deadline_s=0.0))
 
 

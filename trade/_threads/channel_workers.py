@@ -1,8 +1,9 @@
 """Worker threads for one channel (leader/followers): one thread always waits for the next message.
 
-Quick calls need only a few threads, however many calls arrive: more threads would wait for each other and for the
-interpreter lock. So, beyond a few threads, a call that finds no idle one waits a moment for one to return before the
-pool starts another. A thread that returns to enough idle ones ends.
+Quick calls need only two threads, however many calls arrive: more threads would wait for each other and for the
+interpreter lock. So, beyond two, a call that finds no idle thread waits a moment for one to return before the pool
+starts another. If none has returned for a moment though some work, these are not quick, and it does not wait. A thread
+that returns to enough idle ones ends.
 """
 
 import logging
@@ -16,7 +17,7 @@ from trade.transport.base import Channel, ChannelClosed, Message
 _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
-_FEW: Final = 4
+_FEW: Final = 2
 _MOMENT_S: Final = 0.005
 """A call that takes longer is not quick."""
 
@@ -38,6 +39,8 @@ class WorkerPool:
         self._back = threading.Condition(self._lock)
         self._expecting = 0
         """Threads that wait for another one to return."""
+        self._since_s = 0.0
+        """When one last returned, or began to work while no other did, by ``time.monotonic()``."""
         self._threads: list[threading.Thread] = []
         self._spawned = 0
         self._idle = 0
@@ -83,6 +86,8 @@ class WorkerPool:
     def _leave_idle(self) -> bool:
         """Whether this thread may run the call: another one must remain to take the next call."""
         with self._lock:
+            if self._idle == len(self._threads):
+                self._since_s = time.monotonic()
             if self._idle == 1 and not self._get_another():
                 return False
             self._idle -= 1
@@ -91,9 +96,10 @@ class WorkerPool:
 
     def _get_another(self) -> bool:
         """Whether another thread returns in a moment, or can be started. Requires the lock."""
-        if _FEW <= len(self._threads) < MOST_THREADS:
+        patience_s = self._since_s + _MOMENT_S - time.monotonic()
+        if patience_s > 0 and _FEW <= len(self._threads) < MOST_THREADS:
             self._expecting += 1
-            self._back.wait_for(lambda: self._idle > 1 or self._closed, _MOMENT_S)
+            self._back.wait_for(lambda: self._idle > 1 or self._closed, patience_s)
             self._expecting -= 1
         if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._closed:
             try:
@@ -105,6 +111,7 @@ class WorkerPool:
     def _join_idle(self) -> bool:
         """Whether this thread, whose call has ended, takes more calls."""
         with self._lock:
+            self._since_s = time.monotonic()
             if self._idle >= _FEW:
                 self._threads.remove(threading.current_thread())
                 return False

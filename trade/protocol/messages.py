@@ -318,6 +318,7 @@ def decode_provider(payload: bytes) -> ProviderInfo:
         "services": services,
         "kind": intern(message.kind),
         "host": intern(message.host),
+        "kinds": tuple(map(intern, message.kinds)),
     }
     return ProviderInfo(**fields)
 

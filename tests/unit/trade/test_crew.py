@@ -2,12 +2,13 @@
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator
 from statistics import median
 
 import pytest
 
-from trade._threads.channel_workers import MOST_THREADS, WorkerPool
+from trade._threads.channel_workers import _MOMENT_S, MOST_THREADS, WorkerPool
 from trade.transport.base import Channel, ChannelClosed, Message
 
 pytestmark = pytest.mark.virtual_time
@@ -74,6 +75,26 @@ def test_slow_calls_get_a_thread_each_which_ends_with_them(
     assert refused.wait(20)
     assert crew.draining
     leave.set()
-    assert eventually(lambda: sum(thread.name.startswith("slow-") for thread in threading.enumerate()) == 4)
+    assert eventually(lambda: sum(thread.name.startswith("slow-") for thread in threading.enumerate()) == 2)
+    crew.close()
+    crew.wait(20)
+
+
+def test_of_slow_calls_that_come_together_all_have_begun_after_a_moment(channel: Queue) -> None:
+    """Seven joints of an arm that are started one by one: no joint waits for the ones before it."""
+    inside, leave = threading.Semaphore(0), threading.Event()
+
+    def work(_message: Message) -> None:
+        inside.release()
+        leave.wait(60)
+
+    crew = WorkerPool("slow", channel, work, refuse=work)
+    began_s = time.monotonic()
+    for _ in range(7):
+        channel.waiting.put(CALL)
+    for _ in range(7):
+        assert inside.acquire(timeout=20)
+    assert time.monotonic() - began_s < 2 * _MOMENT_S
+    leave.set()
     crew.close()
     crew.wait(20)

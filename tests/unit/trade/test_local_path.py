@@ -492,14 +492,14 @@ def test_many_callers_at_once_each_get_their_own_answer(there: Container, add: H
 def test_free_connections_are_few(there: Container, add: Handle, gate: Gate, here: Container) -> None:
     there.register(gate, "gate")
     enter = found(here, "pass_through")
-    threads = [threading.Thread(target=enter) for _ in range(20)]
+    threads = [threading.Thread(target=enter) for _ in range(50)]
     for thread in threads:
         thread.start()
-    wait_until(lambda: server(there).working == 20, "all are inside")
+    wait_until(lambda: server(there).working == 50, "all are inside")
     gate.open.set()
     for thread in threads:
         thread.join(20)
-    wait_until(lambda: len(server(there)._threads) <= 9, "the rest is closed")
+    wait_until(lambda: len(server(there)._threads) <= 33, "the rest is closed")
     assert add(1) == 2
 
 

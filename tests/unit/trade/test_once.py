@@ -187,6 +187,17 @@ def test_large_answers_are_dropped_first_but_not_the_record_that_they_were_given
     assert last.answer[0] == Status.OK
 
 
+def test_the_answer_that_says_that_one_was_dropped_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large answer drops a thousand small ones, and the calls of others wait meanwhile."""
+    monkeypatch.setattr(active_calls, "MOST_BYTES", 10_000)
+    once = CallDeduplicator()
+    for i in range(1000):
+        end(once, call(i, expires_ns=LATER), b"x")
+    end(once, call(1000, expires_ns=LATER), b"x" * 9_990)
+    dropped = [once.find("me", call(i)) for i in range(900)]
+    assert len({id(one.answer) for one in dropped if one is not None}) == 1
+
+
 @pytest.mark.usefixtures("no_local_path")
 @pytest.mark.parametrize("how", ["call", "start"])
 def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
