@@ -1,12 +1,15 @@
 """Worker threads for one channel (leader/followers): one thread always waits for the next message.
 
-Quick calls need only two threads, however many calls arrive: more threads would wait for each other and for the
-interpreter lock. So, beyond two, a call that finds no idle thread waits a moment for one to return before the pool
-starts another. If none has returned for a moment though some work, these are not quick, and it does not wait. A thread
-that returns to enough idle ones ends.
+Quick calls need only a few threads, however many calls arrive: more threads would wait for each other and for the
+interpreter lock. Slow calls need a thread each, and none of them should wait for another: they may start the joints of
+an arm. Calls count as quick while a thread has returned within a moment. A call that finds no idle thread starts one:
+up to four threads while calls are quick, and up to eight else. Beyond these it waits a moment for one to return. If
+none returns, the calls that run are slow, and the next ones do not wait. A thread that returns to enough idle ones
+ends.
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +20,10 @@ from trade.transport.base import Channel, ChannelClosed, Message
 _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
-_FEW: Final = 2
+_FEW: Final = 4
+"""Threads for quick calls."""
+_SEVERAL: Final = 8
+"""Threads for calls of which none has returned, without waiting for one."""
 _MOMENT_S: Final = 0.005
 """A call that takes longer is not quick."""
 
@@ -39,8 +45,8 @@ class WorkerPool:
         self._back = threading.Condition(self._lock)
         self._expecting = 0
         """Threads that wait for another one to return."""
-        self._since_s = 0.0
-        """When one last returned, or began to work while no other did, by ``time.monotonic()``."""
+        self._returned_s = self._busy_s = -math.inf
+        """When one last returned, and when one last began to work while no other did, by ``time.monotonic()``."""
         self._threads: list[threading.Thread] = []
         self._spawned = 0
         self._idle = 0
@@ -87,7 +93,7 @@ class WorkerPool:
         """Whether this thread may run the call: another one must remain to take the next call."""
         with self._lock:
             if self._idle == len(self._threads):
-                self._since_s = time.monotonic()
+                self._busy_s = time.monotonic()
             if self._idle == 1 and not self._get_another():
                 return False
             self._idle -= 1
@@ -96,8 +102,10 @@ class WorkerPool:
 
     def _get_another(self) -> bool:
         """Whether another thread returns in a moment, or can be started. Requires the lock."""
-        patience_s = self._since_s + _MOMENT_S - time.monotonic()
-        if patience_s > 0 and _FEW <= len(self._threads) < MOST_THREADS:
+        now_s = time.monotonic()
+        enough = _FEW if now_s < self._returned_s + _MOMENT_S else _SEVERAL
+        patience_s = max(self._returned_s, self._busy_s) + _MOMENT_S - now_s
+        if patience_s > 0 and enough <= len(self._threads) < MOST_THREADS:
             self._expecting += 1
             self._back.wait_for(lambda: self._idle > 1 or self._closed, patience_s)
             self._expecting -= 1
@@ -111,7 +119,7 @@ class WorkerPool:
     def _join_idle(self) -> bool:
         """Whether this thread, whose call has ended, takes more calls."""
         with self._lock:
-            self._since_s = time.monotonic()
+            self._returned_s = time.monotonic()
             if self._idle >= _FEW:
                 self._threads.remove(threading.current_thread())
                 return False
