@@ -441,9 +441,11 @@ class Components:
 
         Calls to it, and locks of its resources, wait for the transport's sign: its last answers may be under way.
         """
-        self.dispatcher.hang_up(address)  # before its locks end: see `Caller` on answers that grant
-        if self.locks.session_error((str(address),)) is None:  # the other sign was earlier
-            self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+        try:
+            self.dispatcher.hang_up(address)  # before its locks end: see `Caller` on answers that grant
+        finally:
+            if self.locks.session_error((str(address),)) is None:  # the other sign was earlier
+                self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
         self.dispatcher.forget(address)
 
     def session_ended(self, session: str, reason: str = "it was closed") -> None:

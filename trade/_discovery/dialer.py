@@ -200,7 +200,7 @@ class Dialer:
                     self._refused[found.session] = time.monotonic() + _AGAIN_S
 
     def _redial(self) -> None:
-        for endpoint, session in list(self._kept.items()):
+        for endpoint, session in self._kept.copy().items():
             if self._links.linked(session) if session else self._links.linked_at(endpoint):
                 continue
             there = self._dial(endpoint)

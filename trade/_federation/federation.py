@@ -87,7 +87,7 @@ class Federation:
         return {
             ProviderPlace(state.address, entry.domain, name): entry.info
             for state in self._registry.containers()
-            for name, entry in list(state.providers.items())
+            for name, entry in state.providers.copy().items()
             if entry.records and entry.domain != DOMAIN
         }
 

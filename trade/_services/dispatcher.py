@@ -390,7 +390,7 @@ class Dispatcher:
         """End the connections of a container: what it still reads there counts for nothing."""
         local = f"{caller.who}/{caller.epoch}{LOCAL}"
         with self._lock:
-            gone = [one for key, one in list(self._local_repliers.items()) if key.startswith(local)]
+            gone = [one for key, one in self._local_repliers.copy().items() if key.startswith(local)]
         for replier in gone:
             replier.close()
 

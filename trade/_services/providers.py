@@ -180,7 +180,7 @@ class Providers:
     def prepare_again(self) -> None:
         """Prepare all services once more: what `prepare` depends on has changed."""
         with self._announcing:
-            for place, registered in list(self._hosted.items()):
+            for place, registered in self._hosted.copy().items():
                 self._prepare(place, registered.services, registered.info)
 
     def _require_new(self, provider: object) -> None:
@@ -286,7 +286,7 @@ class Providers:
         """The groups, in the form of keys, of the services that use a resource."""
         return {
             place.partition("/")[0]
-            for place, registered in list(self._hosted.items())
+            for place, registered in self._hosted.copy().items()
             for service in registered.services.values()
             if any(one.name == resource for one in service.resources)
         }
@@ -295,7 +295,7 @@ class Providers:
         """All stop services without required arguments, except the middleware's own."""
         return [
             service
-            for place, registered in list(self._hosted.items())
+            for place, registered in self._hosted.copy().items()
             for service in registered.services.values()
             if service.effect == "stop" and not place.startswith(f"{DOMAIN}/")
             if not any(parameter.required for parameter in service.signature.info.parameters)

@@ -147,7 +147,7 @@ class BorderDirection:
             for place, info in self._home.federation.offers().items()
             if self._is_shared(place, info)
         }
-        for place, offered in list(self._offered.items()):
+        for place, offered in self._offered.copy().items():
             if place not in there or there[place].services != offered.info.services:
                 self._withdraw(place, offered)
         for place, info in there.items():
@@ -295,7 +295,7 @@ class BorderDirection:
         self._thread.join(_PARTING_S)
 
     def _withdraw_all(self) -> None:
-        for place, offered in list(self._offered.items()):
+        for place, offered in self._offered.copy().items():
             self._withdraw(place, offered)
 
     def close(self) -> None:

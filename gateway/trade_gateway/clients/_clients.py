@@ -136,7 +136,7 @@ class Client:
 
     def name_of(self, lock: Lock) -> str:
         """The name of a lock; empty if the client does not have it, or not yet."""
-        return next((name for name, held in list(self._locks.items()) if held.lock is lock), "")
+        return next((name for name, held in self._locks.copy().items() if held.lock is lock), "")
 
     def has_locked(self, handle: Handle) -> bool:
         """Whether it holds all resources of a service."""

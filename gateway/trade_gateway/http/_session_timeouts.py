@@ -64,7 +64,7 @@ class Leases:
         """Ends the sessions of clients that are no longer admitted, until this task is cancelled."""
         while True:
             await asyncio.sleep(_LOOK_EVERY_S)
-            for client, lease in list(self._leases.items()):
+            for client, lease in self._leases.copy().items():
                 if not lease.still():
                     self._end(client)
 

@@ -42,7 +42,7 @@ class SystemGuests:
         Raises:
             ConfigurationError: one of them cannot be started; the others are as the file says.
         """
-        for name, guest in list(self._guests.items()):
+        for name, guest in self._guests.copy().items():
             if plan.shares.get(name) != guest.container.settings or guest.home is not home:
                 self._guests.pop(name).close()
         for name, share in plan.file.share.items():

@@ -1,6 +1,8 @@
 """How a container runs what it is asked: side by side, up to a cap, stops always, ``async def`` too."""
 
 import asyncio
+import gc
+import itertools
 import threading
 from typing import Any
 
@@ -11,9 +13,9 @@ from trade import Container, Handle, Run, current_call, service, where
 from trade._services import dispatcher
 from trade._threads import channel_workers
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
-from trade.protocol.keys import reply_key
+from trade.protocol.keys import LOCAL, Address, reply_key
 from trade.testing import memory_system
-from trade.transport.base import Channel, Message
+from trade.transport.base import Channel, Message, Publisher
 from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
@@ -366,3 +368,42 @@ def test_no_reply_key_is_kept_of_a_caller_that_is_gone(here: Container, there: C
     assert any("/here/" in key for key in repliers)
     here.close()
     wait_until(lambda: not any("/here/" in key for key in list(repliers)))
+
+
+class _Hung(Publisher):
+    """Counts how often it was closed."""
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def put(self, payload: bytes) -> None: ...
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_S05_a_caller_that_ends_is_hung_up_although_another_comes_just_then(here: Container) -> None:
+    """The garbage collector runs finalizers in the middle of a line, and other threads run meanwhile."""
+    calls, gone, other = here._parts.dispatcher, _Hung(), _Hung()
+    ended = Address("tester", "gone", "e1")
+    calls.answer_on("tester", f"gone/e1{LOCAL}0", gone)
+    for number in range(5000):  # so many that the interpreter has no free pairs left, and collects garbage for more
+        calls.answer_on("tester", f"other/e2{LOCAL}{number}", other)
+    numbers = itertools.count(5000)
+
+    def another_comes(phase: str, _: object) -> None:
+        if phase == "start":
+            calls.answer_on("tester", f"other/e2{LOCAL}{next(numbers)}", other)
+
+    usual, enabled = gc.get_threshold(), gc.isenabled()
+    gc.callbacks.append(another_comes)
+    gc.set_threshold(1)
+    gc.enable()
+    try:
+        calls.hang_up(ended)
+    finally:
+        if not enabled:  # as on virtual time
+            gc.disable()
+        gc.set_threshold(*usual)
+        gc.callbacks.remove(another_comes)
+    assert (gone.closed, other.closed) == (1, 0)
