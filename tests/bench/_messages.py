@@ -19,7 +19,7 @@ import msgspec
 from msgspec import Raw
 
 from tests.bench._links import Call, Link, Peer, Pipeline, Threads
-from tests.bench._peers import framed
+from tests.bench._peers import TcpLink, framed
 from trade.protocol.messages import PROTOCOL, LargeBytes, Reply, Status, decode_call, decode_reply
 from trade.protocol.messages import Call as CallMessage
 
@@ -66,7 +66,7 @@ class BareMessages(Peer):
     @contextmanager
     def connect(self, address: str) -> Iterator[Link]:
         with _connected(address) as link:
-            yield _Messages(link)
+            yield TypedMessages(TcpLink(link))
 
 
 class BareMessagesThreads(BareMessages):
@@ -77,7 +77,7 @@ class BareMessagesThreads(BareMessages):
     @contextmanager
     def connect(self, address: str) -> Iterator[Link]:
         with ExitStack() as stack:
-            yield _EachItsOwn(lambda: _Messages(stack.enter_context(_connected(address))))
+            yield _EachItsOwn(lambda: TypedMessages(TcpLink(stack.enter_context(_connected(address)))))
 
 
 class BareCopies(BareMessages):
@@ -132,29 +132,8 @@ class _Copies:
         return self._place[:size]
 
 
-class _Messages(Pipeline):
-    def __init__(self, link: socket.socket) -> None:
-        self._link = link
-        self._ids = itertools.count(1)
-
-    def begin(self, payload: bytes) -> None:
-        _send(self._link, self.message(Raw(_encode((payload,)))))
-
-    def message(self, arguments: Raw) -> bytes:
-        expires_ns = time.monotonic_ns() + 10**10
-        return _KEY + _encode(
-            CallMessage(PROTOCOL, next(self._ids), "echo", "client/1", _CALLER, expires_ns, (), arguments)
-        )
-
-    def end(self, begun: None) -> bytes:
-        return _decode_result(decode_reply(framed(self._link)[_SIZE_BYTES:]).body)
-
-    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
-        super().burst(payload, n, min(in_flight, max(1, _MOST_UNREAD // len(payload))))
-
-
-class TypedMessages(_Messages):
-    """The same messages over another link."""
+class TypedMessages(Pipeline):
+    """The two messages of a call over any link, encoded and decoded at both ends."""
 
     def __init__(self, link: Pipeline) -> None:
         self._link = link
@@ -163,13 +142,22 @@ class TypedMessages(_Messages):
     def begin(self, payload: bytes) -> Any:
         return self._link.begin(self.message(Raw(_encode((payload,)))))
 
+    def message(self, arguments: Raw) -> bytes:
+        expires_ns = time.monotonic_ns() + 10**10
+        return _KEY + _encode(
+            CallMessage(PROTOCOL, next(self._ids), "echo", "client/1", _CALLER, expires_ns, (), arguments)
+        )
+
     def end(self, begun: Any) -> bytes:
         return _decode_result(decode_reply(self._link.end(begun)).body)
 
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        super().burst(payload, n, min(in_flight, max(1, _MOST_UNREAD // len(payload))))
 
-class _CopiedMessages(_Messages):
+
+class _CopiedMessages(TypedMessages):
     def __init__(self, link: socket.socket, copies: _Copies) -> None:
-        super().__init__(link)
+        super().__init__(TcpLink(link))
         self._copies = copies
 
     def begin(self, payload: bytes) -> None:

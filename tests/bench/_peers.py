@@ -33,10 +33,12 @@ class Tcp(Peer):
     def connect(self, address: str) -> Iterator[Link]:
         with socket.create_connection(tuple(json.loads(address))) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            yield _TcpLink(link)
+            yield TcpLink(link)
 
 
-class _TcpLink(Pipeline):
+class TcpLink(Pipeline):
+    """Messages on a socket of any family, a length before each."""
+
     def __init__(self, link: socket.socket) -> None:
         self._link = link
 

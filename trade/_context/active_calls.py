@@ -39,7 +39,7 @@ class ActiveCall:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "queued_ns", "report", "size", "unsent"),
+        *("cancelled", "queued_ns", "report", "service", "size", "unsent"),
     )
 
     def __init__(self, caller: str, call: Call | None, report: "Callable[[ActiveCall, Any], None] | None") -> None:
@@ -53,6 +53,8 @@ class ActiveCall:
         self.answer: Answer | None = None
         self.also: list[Call] | None = None
         """Repetitions of the same call that arrived while it ran."""
+        self.service = ""
+        """The service's name, once its answer is kept."""
         self.size = 0
         self.queued_ns = 0
         """When it entered the queue of a serial provider; 0 if it did not."""
@@ -180,13 +182,13 @@ class CallDeduplicator:
         return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
 
     def _keep_body(self, key: Key, ongoing: ActiveCall, size: int, service: str) -> None:
-        ongoing.size = size
+        ongoing.service, ongoing.size = service, size
         self._bytes += size
         self._bodies[key] = ongoing
         while self._bytes > MOST_BYTES:
             _, oldest = self._bodies.popitem(last=False)
             self._bytes -= oldest.size
-            oldest.answer = _unknown(service)
+            oldest.answer = _unknown(oldest.service)
 
     def _evict(self, now_ns: int) -> None:
         """Forgets calls that can no longer be repeated, and above the limit those that are nearest to that."""

@@ -15,7 +15,7 @@ from trade._threads.scheduler import NEVER, Scheduler
 GRACE_S: Final = 1.0
 _LOOK_S: Final = 0.05
 _LEAVING_S: Final = 2.0
-"""How long a bridge takes to close its links, at most."""
+"""How long after a bridge a session may disappear because of it."""
 _END_S: Final = 2.0
 
 

@@ -192,10 +192,13 @@ def test_the_answer_that_says_that_one_was_dropped_is_made_once(monkeypatch: pyt
     monkeypatch.setattr(active_calls, "MOST_BYTES", 10_000)
     once = CallDeduplicator()
     for i in range(1000):
-        end(once, call(i, expires_ns=LATER), b"x")
-    end(once, call(1000, expires_ns=LATER), b"x" * 9_990)
-    dropped = [once.find("me", call(i)) for i in range(900)]
-    assert len({id(one.answer) for one in dropped if one is not None}) == 1
+        end(once, call(i, "small", expires_ns=LATER), b"x")
+    end(once, call(1000, "large", expires_ns=LATER), b"x" * 9_990)
+    dropped = [one.answer for i in range(900) if (one := once.find("me", call(i))) is not None]
+    assert len(dropped) == 900
+    assert len(set(map(id, dropped))) == 1
+    assert dropped[0] is not None
+    assert b"small" in bytes(dropped[0][1])  # the service whose answer it was
 
 
 @pytest.mark.usefixtures("no_local_path")

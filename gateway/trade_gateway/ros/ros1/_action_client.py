@@ -209,7 +209,7 @@ class ActionClient:
             elif state in ENDED:
                 with self._lock:
                     self._unwanted.pop(number, None)
-        for number, goal in list(self._goals.items()):
+        for number, goal in self._goals.copy().items():
             if goal.server == sender:
                 self._judge(goal, states.get(number), at)
 
