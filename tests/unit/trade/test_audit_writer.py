@@ -190,10 +190,10 @@ import resource, logging
 logging.basicConfig()
 import trade._audit.writer as writing
 from trade._audit.events import Event
-from trade._audit.store import Keep
+from trade._audit.store import Retention
 from pathlib import Path
 writing._AGAIN_S = 0.01
-writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))
+writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Retention(90, 10**6))
 event = Event(1, 1, "call", "rosie." + "x" * 400, "", "anna", "", 7, 3, "ok", "", 5)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
 for _ in range(2000):
@@ -343,7 +343,7 @@ def test_killed_at_any_step_it_leaves_a_record_that_verifies(path: Path) -> None
 import os, signal, sqlite3, sys
 import trade._audit.writer as writing
 from trade._audit.hash_chain import verify
-from trade._audit.store import AuditStore, Keep, reading
+from trade._audit.store import AuditStore, Retention, reading
 from trade._audit.events import Event
 from pathlib import Path
 path = Path({str(path)!r})
@@ -372,7 +372,7 @@ def write():
     row = writing._row_of(Event(1, 1, "call", "rosie.step", "", "anna", "", 7, 3, "ok", "", 5), "boot")
     for _ in range(3):
         store.add([row] * 3)
-        store.drop(Keep(1, 4, least=0, piece=2), row)
+        store.drop(Retention(1, 4, least=0, piece=2), row)
     store.close()
 steps = 0
 while True:
@@ -405,11 +405,11 @@ print(steps, verdict.head.seq)
 def test_its_process_killed_under_load_leaves_a_record_that_verifies_and_can_be_added_to(path: Path) -> None:
     program = f"""
 import trade._audit.writer as writing
-from trade._audit.store import Keep
+from trade._audit.store import Retention
 from trade._audit.events import Event
 from pathlib import Path
 writing._GATHER_S = 0.001
-writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))
+writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Retention(90, 10**6))
 event = Event(1, 1, "call", "rosie.step", "", "anna", "", 7, 3, "ok", "", 5)
 said = False
 while True:
