@@ -9,7 +9,7 @@ from functools import lru_cache
 from heapq import heappop, heappush
 from typing import Any, Final
 
-from msgspec import Raw
+from msgspec import Raw, Struct
 
 from trade._context.sessions import within
 from trade._threads.scheduler import Scheduler
@@ -23,6 +23,8 @@ GRACE_NS: Final = 5_000_000_000
 """How long after its deadline a call's answer is kept."""
 MOST_BYTES: Final = 64 << 20
 MOST_CALLS: Final = 65_536
+_FORGOTTEN_AT_ONCE: Final = 8
+"""How many calls one call forgets: after a burst, none pays for all of them."""
 _MOST_CALLERS: Final = 1024
 _END_S: Final = 2.0
 
@@ -39,7 +41,7 @@ class ActiveCall:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "queued_ns", "report", "service", "size", "unsent"),
+        *("cancelled", "queued_ns", "report", "unsent"),
     )
 
     def __init__(self, caller: str, call: Call | None, report: "Callable[[ActiveCall, Any], None] | None") -> None:
@@ -53,9 +55,6 @@ class ActiveCall:
         self.answer: Answer | None = None
         self.also: list[Call] | None = None
         """Repetitions of the same call that arrived while it ran."""
-        self.service = ""
-        """The service's name, once its answer is kept."""
-        self.size = 0
         self.queued_ns = 0
         """When it entered the queue of a serial provider; 0 if it did not."""
         self._event: threading.Event | None = None
@@ -98,6 +97,16 @@ class ActiveCall:
         return event.wait(timeout_s)
 
 
+class KeptAnswer(Struct, gc=False):
+    """What remains of an ended call. The garbage collector does not visit it, as there are tens of thousands."""
+
+    answer: Answer
+    service: str
+    """The service's name."""
+    size: int
+    """Bytes of the answer's body."""
+
+
 def end_calls(cancels: Sequence[Callable[[], object]]) -> None:
     """Asks calls to end, on another thread, so that their callbacks do not delay the caller."""
     if cancels:
@@ -120,81 +129,93 @@ class CallDeduplicator:
     """
 
     def __init__(self) -> None:
-        self._calls: dict[Key, ActiveCall] = {}
+        self._running: dict[Key, ActiveCall] = {}
+        self._kept: dict[Key, KeptAnswer] = {}
         self._until: list[tuple[int, Key]] = []
         """A heap of times from which kept calls may be forgotten."""
-        self._bodies: OrderedDict[Key, ActiveCall] = OrderedDict()
+        self._bodies: OrderedDict[Key, KeptAnswer] = OrderedDict()
         """The oldest first, which is found at once however many came before it."""
         self._bytes = 0
         self._evicted: dict[Key, int] = {}
         """Caller and upper bits of its ids -> the highest id that was evicted early; ids count upwards."""
         self._lock = threading.Lock()
 
-    def begin(self, call: Call, ongoing: ActiveCall) -> ActiveCall:
+    def begin(self, call: Call, ongoing: ActiveCall) -> ActiveCall | KeptAnswer:
         """Records a call; returns the earlier one if it is a repetition, which must not run again."""
-        found = self._calls.setdefault((ongoing.caller, call.id), ongoing)
-        if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
-            ongoing.answer = _unknown(call.service)
-            self._calls.pop((ongoing.caller, call.id), None)
-        return found
+        key = ongoing.caller, call.id
+        with self._lock:
+            kept = self._kept.get(key)
+            if kept is not None:
+                return kept
+            found = self._running.setdefault(key, ongoing)
+            if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
+                ongoing.answer = _unknown(call.service)
+                del self._running[key]
+            return found
 
-    def find(self, caller: str, call: Call) -> ActiveCall | None:
-        return self._calls.get((caller, call.id))
+    def find(self, caller: str, call: Call) -> ActiveCall | KeptAnswer | None:
+        with self._lock:
+            return self._find((caller, call.id))
 
-    def attach(self, ongoing: ActiveCall, again: Call) -> Answer | None:
+    def _find(self, key: Key) -> ActiveCall | KeptAnswer | None:
+        """Requires the lock."""
+        return self._running.get(key) or self._kept.get(key)
+
+    def attach(self, first: ActiveCall | KeptAnswer, again: Call) -> Answer | None:
         """The answer to a repeated call; None while it runs: the answer then goes to the repetition, too."""
         with self._lock:
-            if ongoing.answer is None:
-                ongoing.also = [*(ongoing.also or ()), again]
-            return ongoing.answer
+            if isinstance(first, ActiveCall) and first.answer is None:
+                first.also = [*(first.also or ()), again]
+            return first.answer
 
     def end(self, ongoing: ActiveCall, call: Call, answer: Answer, *, keep: bool) -> list[Call] | None:
         """Records how it ended; returns the repetitions to answer."""
         with self._lock:
             ongoing.answer = answer
             ongoing.call = ongoing.report = None  # the arguments may be large
-            key = (ongoing.caller, call.id)
+            key = ongoing.caller, call.id
+            self._running.pop(key, None)
             if keep:
                 now = time.monotonic_ns()
-                self._keep_body(key, ongoing, len(answer[1]), call.service)
-                heappush(self._until, ((call.expires_ns or now) + GRACE_NS, key))
-                self._evict(now)
-            else:
-                self._calls.pop(key, None)
+                kept = self._bodies[key] = KeptAnswer(answer, call.service, len(answer[1]))
+                self._bytes += kept.size
+                self._drop_bodies()
+                self._keep(key, kept, call.expires_ns or now, now)
             return ongoing.also
 
     def cancel(self, caller: str, call_id: int, service: str, keep_s: float) -> None:
         """Cancels a call of this caller: asks it to end, or prevents it from starting if it has not arrived yet."""
         with self._lock:
-            found = self._calls.get((caller, call_id))
+            found = self._find((caller, call_id))
             if found is None:
-                never = ActiveCall(caller, None, None)
-                never.answer = cancelled(service)
                 now = time.monotonic_ns()
-                self._calls[caller, call_id] = never
-                heappush(self._until, (now + int(keep_s * 1e9) + GRACE_NS, (caller, call_id)))
-                self._evict(now)
-        if found is not None and found.answer is None:
+                self._keep((caller, call_id), KeptAnswer(cancelled(service), service, 0), now + int(keep_s * 1e9), now)
+        if isinstance(found, ActiveCall) and found.answer is None:
             found.cancel()
 
     def made_for(self, session: str) -> list[ActiveCall]:
         """Running calls that are made by a session or a part of it, or on its behalf."""
-        return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
+        return [one for one in self._running.copy().values() if one.answer is None and _is_for(one.call, session)]
 
-    def _keep_body(self, key: Key, ongoing: ActiveCall, size: int, service: str) -> None:
-        ongoing.service, ongoing.size = service, size
-        self._bytes += size
-        self._bodies[key] = ongoing
+    def _drop_bodies(self) -> None:
+        """Drops the oldest answers until the others are small enough together."""
         while self._bytes > MOST_BYTES:
             _, oldest = self._bodies.popitem(last=False)
             self._bytes -= oldest.size
             oldest.answer = _unknown(oldest.service)
 
+    def _keep(self, key: Key, kept: KeptAnswer, expires_ns: int, now_ns: int) -> None:
+        self._kept[key] = kept
+        heappush(self._until, (expires_ns + GRACE_NS, key))
+        self._evict(now_ns)
+
     def _evict(self, now_ns: int) -> None:
-        """Forgets calls that can no longer be repeated, and above the limit those that are nearest to that."""
-        while self._until and (self._until[0][0] < now_ns or len(self._calls) > MOST_CALLS):
+        """Forgets some calls that can no longer be repeated, and above the limit those that are nearest to that."""
+        for _ in range(_FORGOTTEN_AT_ONCE):
+            if not self._until or (self._until[0][0] >= now_ns and len(self._kept) <= MOST_CALLS):
+                return
             until_ns, key = heappop(self._until)
-            self._calls.pop(key, None)
+            self._kept.pop(key, None)
             if key in self._bodies:
                 self._bytes -= self._bodies.pop(key).size
             if until_ns >= now_ns:

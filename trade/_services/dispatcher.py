@@ -19,6 +19,7 @@ from trade._context.active_calls import (
     ActiveCall,
     Answer,
     CallDeduplicator,
+    KeptAnswer,
     ProgressReporter,
     cancelled,
     end_calls,
@@ -273,7 +274,7 @@ class Dispatcher:
 
     # --- repeated calls, and calls about calls
 
-    def _again(self, first: ActiveCall, incoming: IncomingCall) -> None:
+    def _again(self, first: ActiveCall | KeptAnswer, incoming: IncomingCall) -> None:
         """A repeated call: it gets the answer of the first one, and never runs again."""
         answer = self._deduplicator.attach(first, incoming.call)
         if answer is not None:

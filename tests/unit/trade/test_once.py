@@ -1,5 +1,6 @@
 """S02: a call that comes twice runs once, is answered as often as it came, and its answer is kept in bounds."""
 
+import gc
 import threading
 import time
 from typing import Any
@@ -130,7 +131,8 @@ def test_what_expired_is_said_to_have_expired_however_often_it_comes(line: Line,
 def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None:
     line.put(call(name="look"))
     line.answer()
-    assert here._parts.dispatcher._deduplicator._calls == {}
+    once = here._parts.dispatcher._deduplicator
+    assert (once._running, once._kept) == ({}, {})
 
 
 def begun(once: CallDeduplicator, one: Call) -> ActiveCall:
@@ -155,13 +157,34 @@ def test_answers_are_dropped_some_seconds_after_their_deadline(monkeypatch: pyte
     assert all(once.find("me", call(i)) for i in range(600, 1200))
 
 
+def test_no_call_forgets_a_whole_burst_of_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All calls wait while one forgets: for 65,536 of them, 0.2 to 0.3 s."""
+    once = CallDeduplicator()
+    for i in range(1000):
+        end(once, call(i))
+    monkeypatch.setattr(active_calls, "MOST_CALLS", 10)
+    end(once, call(1000))
+    assert len(once._kept) > 990
+    for i in range(1001, 1200):
+        end(once, call(i))
+    assert len(once._kept) == 10
+
+
+def test_what_is_kept_of_a_call_never_delays_the_garbage_collector() -> None:
+    """It stops all threads while it visits every object, and tens of thousands of answers are kept."""
+    once = CallDeduplicator()
+    for i in range(100):
+        end(once, call(i))
+    assert not any(map(gc.is_tracked, once._kept.values()))
+
+
 def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(active_calls, "MOST_CALLS", 1024)
     once = CallDeduplicator()
     running = begun(once, call(0))
     for i in range(1, 3000):
         end(once, call(i))
-    assert len(once._calls) <= 1024
+    assert len(once._kept) <= 1024
     assert once.find("me", call(0)) is running
     assert running.answer is None
     forgotten = ActiveCall("me", call(1), None)
