@@ -146,7 +146,7 @@ class Source:
 
     def tick(self) -> int | None:
         """Sample the service if it has listeners; returns the time of the next tick."""
-        now = time.monotonic_ns()
+        at, now = time.time(), time.monotonic_ns()
         self.drop(lambda _, request: request.until_ns <= now)
         service = self._services(self._key)
         requested = {} if service is None else self._rates_requested()
@@ -155,7 +155,7 @@ class Source:
             if service is None or not requested:
                 self._next_ns = 0
                 return None
-            at, every_ns = time.time(), period_ns(max(requested))
+            every_ns = period_ns(max(requested))
             answer = self._sampled(service, now)
             for hz, how in requested.items():
                 self._rates[hz].offer(answer, at, now, how, every_ns)

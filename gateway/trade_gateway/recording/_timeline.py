@@ -64,4 +64,5 @@ class Timeline:
         return running_s + ahead_s
 
     def _step_ns(self) -> int:
-        return time.time_ns() - self.now_ns()
+        now_ns = self.now_ns()  # first: an interruption between the two then places samples too early, not too late
+        return time.time_ns() - now_ns

@@ -147,6 +147,23 @@ def test_a_source_whose_monotonic_clock_restarts_is_placed_again() -> None:
     assert timeline.placed("pi", timeline.now_s(), 10**9) == pytest.approx(timeline.now_s(), abs=0.1)
 
 
+def test_an_interruption_between_two_clocks_places_no_later_sample_after_it_arrived(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    timeline, wall_ns = Timeline(), time.time_ns
+
+    def interrupted() -> int:
+        read_ns = wall_ns()
+        time.sleep(0.01)
+        return read_ns
+
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time_ns", interrupted)
+        timeline.placed("pi", time.time(), time.monotonic_ns())
+    at, at_ns = time.time(), time.monotonic_ns()
+    assert timeline.placed("pi", at, at_ns) <= timeline.now_s()
+
+
 def _states(*stamps_s: float) -> Iterator[JointStates]:
     for number, stamp_s in enumerate(stamps_s):
         lists: dict[str, Any] = {"velocity_rad_s": [0.0], "load": [0.0], "enabled": [True], "fault": [""]}

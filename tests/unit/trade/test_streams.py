@@ -15,6 +15,7 @@ from trade.errors import ConfigurationError
 from trade.protocol.messages import EMPTY, PROTOCOL
 from trade.protocol.samples import STEPS_HZ, StreamSample, stream_key
 from trade.testing import MemorySystem
+from trade.transport.base import Publisher
 
 pytestmark = pytest.mark.virtual_time
 
@@ -26,6 +27,21 @@ def test_samples_come_in_order_with_the_time_they_were_taken_at(two: Two) -> Non
     assert [sample.value for sample in samples] == [1, 2, 3, 4, 5]
     assert all(early.at_ns < late.at_ns for early, late in itertools.pairwise(samples))
     assert all(early.at <= late.at for early, late in itertools.pairwise(samples))
+
+
+def test_the_two_times_of_a_sample_are_of_one_moment(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first sample waits for its publisher. A recording adds the difference of its times to all later ones."""
+    transport = two.there._parts.transport
+    publish = transport.publish
+
+    def slowly(*args: Any, **options: Any) -> Publisher:
+        time.sleep(0.5)
+        return publish(*args, **options)
+
+    monkeypatch.setattr(transport, "publish", slowly)
+    with two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as stream:
+        first, *_, last = some(stream, 5)
+    assert first.at - first.at_ns / 1e9 == pytest.approx(last.at - last.at_ns / 1e9, abs=0.25)
 
 
 def test_a_service_without_listeners_is_not_polled(two: Two) -> None:
