@@ -14,8 +14,8 @@ import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
 from tests.bench._children import Job
 from tests.bench._flood import FLOODS
+from tests.bench._messages import BareMessages
 from tests.bench._others import Grpc, Pyro5, Rpyc
-from tests.bench._peers import Tcp
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
@@ -92,9 +92,9 @@ def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
     each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    others = [peer.name for peer in (Tcp(), Rpyc(), Pyro5(), Grpc(), Rospy(), Viam()) if not peer.missing]
-    small = (*each[:2], *(f"p50 / {other}" for other in others), "p99 / p50")
-    of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
+    others = [peer.name for peer in (BareMessages(), Rpyc(), Pyro5(), Grpc(), Viam()) if not peer.missing]
+    small = (*each[:2], *(f"p50 / {other}" for other in others), "p99 / p50, over raw TCP's")
+    of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("p50 / bare copies", "p50 / rpyc")}
     assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
 
@@ -102,7 +102,12 @@ def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> No
     printed = bench("in-flight", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, threads"):
         assert len(re.findall(rf"^{peer}[^:]*$", printed, re.MULTILINE)) == len(SIZES)
-    shares = [f"{size}, {who}: rate / bare pair" for size in SIZES for who in ("TRADE", "TRADE, threads")]
+    floors = {size: "bare messages, threads" if size == "64 KiB" else "bare pair" for size in SIZES}
+    shares = [
+        share
+        for size, floor in floors.items()
+        for share in (f"{size}, TRADE: rate / {floor}", f"{size}, TRADE, threads: rate / bare messages, threads")
+    ]
     assert targets(printed) == [*shares[:2], "64 B, 32 in flight: /s", *shares[2:]]
 
 
@@ -165,11 +170,15 @@ def test_the_Viam_SDK_answers_in_an_environment_of_its_own() -> None:
 
 def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
     printed = bench("local", "-n", "3", "--rounds", "2", "--json", str(tmp_path / "run.json"))
-    assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call", "local: attribute / handle"]
+    assert targets(printed) == [
+        "local, strict: us a call",
+        "local, not strict / bare context",
+        "local: attribute / handle",
+    ]
     run = Run.read(tmp_path / "run.json")
     assert [target.name for target in run.targets] == targets(printed)
     assert [(point.part, point.name) for point in run.points] == [
-        ("local", name) for name in ("plain method", "strict", "strict=False", "strict, attribute")
+        ("local", name) for name in ("plain method", "bare context", "strict", "strict=False", "strict, attribute")
     ]
     assert all(point.n == 2 * 50 * 3 and point.values["us"].rounds == 2 for point in run.points)
     assert run.took_s is not None
@@ -209,7 +218,7 @@ def test_the_bench_of_watching_prints_its_targets() -> None:
 
 def test_the_bench_of_audit_records_prints_its_targets() -> None:
     printed = bench("audit", "-n", "3", "--rounds", "1", "--seconds", "0.3")
-    assert targets(printed) == ["p50: audit on / off", "p99: audit on / off", "records/s written"]
+    assert targets(printed) == ["p50: audit on / off", "p99: with records / without", "records/s written"]
 
 
 def test_the_bench_of_streams_prints_its_target() -> None:
@@ -243,10 +252,14 @@ def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() 
     assert targets(printed) == [
         "idle gateway: RSS, MiB",
         "idle gateway: % of a core",
-        *(f"{flood.name}: {what}" for flood in FLOODS for what in ("call p99 / none", "stop, ms")),
+        *(
+            f"{flood.name}: {what}"
+            for flood in FLOODS
+            for what in ("call p99, ms" if flood.kind == "stop" else "call p99 / none", "stop, ms")
+        ),
         "one gateway: p50 / direct",
-        "one gateway: p50 / bare pair",
-        "one, plain: p50 / bare, plain",
+        "one gateway: p50 / bare messages",
+        "one, plain: p50 / bare messages, plain",
         "two gateways: p50 / direct",
         "one gateway, 32 in flight: /s",
     ]
@@ -263,7 +276,7 @@ def test_the_bench_of_the_deadman_prints_every_way_to_end() -> None:
 def test_the_bench_of_many_containers_prints_its_targets() -> None:
     printed = bench("scale", "--containers", "4", "--idle", "0.2")
     ours = [
-        "join, bytes each: most / least",
+        "join, bytes each: 4 / 4",
         "remote service: KiB of Python",
         "find: most / least",
         "lock: most / least",

@@ -164,11 +164,11 @@ def test_histograms_have_a_row_a_point_and_one_of_a_thousand_is_seen() -> None:
 def test_the_page_shows_table_and_histograms_of_a_run_that_has_the_part_and_says_nothing_of_one_that_has_not(
     tmp_path: Path,
 ) -> None:
-    assert "itter" not in page.written(a_run(), {})
+    assert "itter" not in page.written(a_run(), page.Why())
     run = a_run()
     run.points.append(jittery("quiet", (0, 0, 999, 0, 1)))
     run.write(tmp_path / "run.json")
-    made = page.files(Run.read(tmp_path / "run.json"), {})
+    made = page.files(Run.read(tmp_path / "run.json"), page.Why())
     assert "![Jitter of bus loops](pictures/performance-jitter.svg)" in made["performance.md"]
     assert "| quiet | 1,000 | 0.25 | -12,340 |" in made["performance.md"]
     assert "the period" in made["performance.md"]
