@@ -43,14 +43,17 @@ def test_navigation_asks_for_the_head_and_gets_it(
     [lock] = onlooker.locks()
     assert (lock.holder.container, lock.holder.purpose) == ("navigate", "navigation")
 
-    # Its first way may be short, as it begins where the other one stopped. The second is from one end to the other.
+    # Its first way may be short, as it begins where the other one stopped. Later ones are from one end to the other.
     wait_until(lambda: len(events(read_log(log), "motion_started", device_id=1, since=began)) >= 2)
     killed = time.monotonic()
     navigating.signal(signal.SIGKILL)
     wait_until(lambda: events(read_log(log), "at_rest", device_id=1, since=killed))
+    start = [one for one in events(read_log(log), "motion_started", device_id=1, since=began) if one.t < killed][-1]
     rest = events(read_log(log), "at_rest", device_id=1, since=killed)[0]
+    assert start.position_rad is not None
     assert rest.position_rad is not None
-    assert rest.position_rad > -1.25, "it stopped on its way, not at its goal"
+    assert abs(start.position_rad) > 1.25
+    assert abs(rest.position_rad - start.position_rad) < 1.25, "it stopped on its way, not at its goal"
     assert not events(read_log(log), "watchdog_expired")
     with onlooker.lock(HEAD, wait_s=20):
         assert [lock.holder.container for lock in onlooker.locks()] == ["onlooker"]
