@@ -18,7 +18,7 @@ from msgspec import Raw, structs
 from trade._calls.arguments import ArgumentEncoder
 from trade._calls.local_path import LocalPath, LocalSlot, LocalStarter
 from trade._calls.peer import CallPublishers, OnReply, Peer, Pending, ReplySlot, Route, ended
-from trade._calls.slot import Slot
+from trade._calls.slot import Sent, Slot
 from trade._telemetry.spans import Spans
 from trade._threads.condition import InterruptibleCondition
 from trade._threads.scheduler import NEVER, Scheduler
@@ -41,6 +41,8 @@ from trade.transport.local_connection import ConnectionEnded
 
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0
+_RESEND_S: Final = 0.25
+"""How long a container that is back may take to answer before it is asked again; twice as long each time."""
 _END_S: Final = 2.0
 _GRANTING: Final = frozenset(("acquire", "renew"))
 """The services of locks whose answer counts only while its connection lasts: a callee that loses this container breaks
@@ -347,22 +349,31 @@ class Caller:
     def resend(self, peer: Peer) -> None:
         """Sends pending calls again after a lost link to the same epoch is back: same ids, no later deadlines.
 
-        The callee runs no id twice. Its clock is requested first, as it may have been suspended meanwhile.
+        The callee runs no id twice. Its clock is requested first, as it may have been suspended meanwhile, and again
+        until it answers: beyond a bridge, its sign of life may be back before the routes of calls and answers are.
         """
+        peer.returns += 1
+        if peer.clock_known or self._unanswered(peer):
+            self._ask_before_resending(peer, peer.returns, _RESEND_S)
+
+    def _ask_before_resending(self, peer: Peer, returned: int, wait_s: float) -> None:
+        clock = self.route(peer, DOMAIN, PROVIDER, stop=False)
+
+        def clock_heard(reply: Reply) -> None:
+            if reply.status == Status.OK:
+                for publisher, data in self._unanswered(peer):
+                    self._put_again(peer, publisher, decode_call(data))
+            elif reply.status == Status.TIMED_OUT and peer.returns == returned:
+                self._ask_before_resending(peer, returned, min(2 * wait_s, _CANCEL_S))
+
+        until_ns = self.clock.now_ns() + int(wait_s * 1e9)
+        self.start(self.new_call(CLOCK, EMPTY_ARGUMENTS), clock, until_ns, clock_heard)
+
+    def _unanswered(self, peer: Peer) -> list[Sent]:
+        """The calls to it that wait for an answer from the transport."""
         sent = [slot.sent for slot in list(self._every) if slot.waiting is not None and slot.waiting[1] is peer]
         started = [pending for pending in list(self._pending.values()) if pending.peer is peer]
-        sent += [pending.sent for pending in started if pending.starter is None]
-        due = [one for one in sent if one is not None]
-        if due:
-            clock = self.route(peer, DOMAIN, PROVIDER, stop=False)
-            soon = self.clock.now_ns() + int(_CANCEL_S * 1e9)
-
-            def clock_heard(reply: Reply) -> None:
-                if reply.status == Status.OK:
-                    for publisher, data in due:
-                        self._put_again(peer, publisher, decode_call(data))
-
-            self.start(self.new_call(CLOCK, EMPTY_ARGUMENTS), clock, soon, clock_heard)
+        return [one for one in (*sent, *(each.sent for each in started if each.starter is None)) if one is not None]
 
     def _put_again(self, peer: Peer, publisher: Publisher, call: Call) -> None:
         deadline_ns = self._deadline_of(call.id)

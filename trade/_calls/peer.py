@@ -29,6 +29,8 @@ class Peer:
         self.answers_on = f"reply/{address.identity}/"
         """The prefix of the keys of its answers."""
         self.lost = lost
+        self.returns = 0
+        """How often its sign of life has appeared."""
         self.unarrived: set[int] = set()
         """Started calls that may not have arrived yet: a call must not overtake them."""
         self.answers = 0

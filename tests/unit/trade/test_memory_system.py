@@ -7,11 +7,13 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from tests.support.waiting import wait_until
 from tests.unit.trade.lamp_provider import Lamp, Pair, found, labels
 from trade import Container, errors, where
 from trade._discovery.announcer import Announcer
@@ -41,6 +43,43 @@ def test_a_name_belongs_to_one_running_container() -> None:
         assert second is not first
         second.close()
         assert system.container("a") is not second
+
+
+@pytest.mark.parametrize("lost", ["call/", "reply/"])
+@pytest.mark.parametrize("begun", ["away", "on the way back"])
+def test_a_container_is_back_although_its_routes_are_not_yet_and_a_call_runs_once(lost: str, begun: str) -> None:
+    """Beyond a bridge that opens again, the sign of life comes first. A call waited for its deadline then."""
+    with memory_system() as system:
+        lamp = Lamp()
+        system.container("b").register(lamp, "robot")
+        caller, dim = system.container("a"), found(system.container("a"))
+        dim(0.5)
+        back = partial(caller._parts.caller.lost, dim.key.address, back=True)
+        heal = system.lose(lambda message: message.key.startswith(lost))
+        if begun == "away":
+            run = dim.start(0.7)
+            back()
+        else:
+            back()
+            run = dim.start(0.7)
+        wait_until(lambda: lamp.values == ([0.5] if lost == "call/" else [0.5, 0.7]))
+        system.advance(1.0)
+        assert not run.done()
+        heal()
+        system.advance(2.0)
+        assert run.result(20) == 0.7
+        assert lamp.values == [0.5, 0.7]
+
+
+def test_a_container_without_callers_is_not_asked_when_it_is_back() -> None:
+    with memory_system() as system:
+        system.container("b").register(Lamp(), "robot")
+        caller, dim = system.container("a"), found(system.container("a"))
+        system.settle()
+        before = system.sent()
+        caller._parts.caller.lost(dim.key.address, back=True)
+        system.settle()
+        assert system.sent() == before
 
 
 def test_at_the_end_every_container_is_closed() -> None:
