@@ -76,6 +76,8 @@ class Caller:
         self._every: list[ReplySlot] = []
         self._free: list[ReplySlot] = []
         self._pending: dict[int, Pending] = {}
+        self._clocks_due: dict[Peer, int] = {}
+        """When to look whether the clock of a container was heard."""
         self._shared: ReplySlot | None = None
         self._threads: list[threading.Thread] = []
         self._closed = False
@@ -356,14 +358,32 @@ class Caller:
         if peer.clock_known or self._unanswered(peer):
             self._ask_before_resending(peer, peer.returns, _RESEND_S)
 
+    def expect_clock(self, peer: Peer) -> None:
+        """Requests the clock of a container, which a first call requests, again if it does not answer soon."""
+        due_ns = self.clock.now_ns() + int(_RESEND_S * 1e9)
+        if self._clocks_due.setdefault(peer, due_ns) == due_ns:
+            self._deadlines.by(due_ns)
+
+    def _look_at_clocks(self, now_ns: int) -> None:
+        for peer, due_ns in self._clocks_due.copy().items():
+            if due_ns <= now_ns:
+                del self._clocks_due[peer]
+                if not (peer.clock_known or peer.lost):
+                    self._ask_before_resending(peer, peer.returns, _RESEND_S)
+
     def _ask_before_resending(self, peer: Peer, returned: int, wait_s: float) -> None:
-        clock = self.route(peer, DOMAIN, PROVIDER, stop=False)
+        try:
+            clock = self.route(peer, DOMAIN, PROVIDER, stop=False)
+        except ChannelClosed:  # meanwhile
+            return
 
         def clock_heard(reply: Reply) -> None:
             if reply.status == Status.OK:
                 for publisher, data in self._unanswered(peer):
                     self._put_again(peer, publisher, decode_call(data))
-            elif reply.status == Status.TIMED_OUT and peer.returns == returned:
+                return
+            again = reply.status == Status.TIMED_OUT and peer.returns == returned
+            if again and (wait_s < _CANCEL_S or self._unanswered(peer)):
                 self._ask_before_resending(peer, returned, min(2 * wait_s, _CANCEL_S))
 
         until_ns = self.clock.now_ns() + int(wait_s * 1e9)
@@ -482,8 +502,9 @@ class Caller:
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 
     def _end_overdue(self) -> float:
-        """Ends the calls that are too late; returns the next deadline."""
+        """Ends the calls that are too late, and looks whether clocks were heard; returns when that is due next."""
         now_ns = self.clock.now_ns()
+        self._look_at_clocks(now_ns)
         self.clock.give_time(lambda: self._next_deadline_ns() <= now_ns)
         self._end(lambda _, deadline_ns: deadline_ns <= now_ns, Status.TIMED_OUT)
         return self._next_deadline_ns()
@@ -491,7 +512,8 @@ class Caller:
     def _next_deadline_ns(self) -> float:
         waiting = [(slot.waiting, slot.ended_id) for slot in self._slots()]
         blocked = [call[2] for call, ended_id in waiting if call is not None and call[0] != ended_id]
-        return min(blocked + [pending.deadline_ns for pending in list(self._pending.values())], default=NEVER)
+        started = [pending.deadline_ns for pending in list(self._pending.values())]
+        return min([*blocked, *started, *self._clocks_due.copy().values()], default=NEVER)
 
     def _end(self, meant: Callable[[object, float], bool], status: int) -> None:
         for slot in self._slots():

@@ -197,6 +197,7 @@ class RemoteTarget:
         values = self._values(args, kwargs, request)
         deadline_ns = request.deadline_ns + self._caller.clock.ahead_ns
         if not self._may_go:
+            self._caller.expect_clock(self._peer)
             reply = self._caller.ask(self._clock_call(request), self._clock, deadline_ns)
             if reply.status != Status.OK:
                 raise self._not_begun(reply, request)
@@ -239,6 +240,7 @@ class RemoteTarget:
         if self._may_go:
             go()
         else:
+            self._caller.expect_clock(self._peer)
             self._caller.start(self._clock_call(request), self._clock, deadline_ns, clock_heard)
 
     @property

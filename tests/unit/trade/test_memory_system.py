@@ -1,5 +1,6 @@
 """A whole system in one process: it converges whatever the network does, and a death lets no other hang."""
 
+import concurrent.futures
 import contextlib
 import random
 import re
@@ -46,29 +47,44 @@ def test_a_name_belongs_to_one_running_container() -> None:
 
 
 @pytest.mark.parametrize("lost", ["call/", "reply/"])
-@pytest.mark.parametrize("begun", ["away", "on the way back"])
-def test_a_container_is_back_although_its_routes_are_not_yet_and_a_call_runs_once(lost: str, begun: str) -> None:
+@pytest.mark.parametrize("begun", ["away", "on the way back", "first", "first, waited for"])
+def test_a_container_appears_before_its_routes_do_and_a_call_runs_once(lost: str, begun: str) -> None:
     """Beyond a bridge that opens again, the sign of life comes first. A call waited for its deadline then."""
-    with memory_system() as system:
-        lamp = Lamp()
+    with memory_system() as system, concurrent.futures.ThreadPoolExecutor() as pool:
+        lamp, first = Lamp(), begun.startswith("first")
         system.container("b").register(lamp, "robot")
         caller, dim = system.container("a"), found(system.container("a"))
-        dim(0.5)
+        if not first:
+            dim(0.5)
         back = partial(caller._parts.caller.lost, dim.key.address, back=True)
         heal = system.lose(lambda message: message.key.startswith(lost))
+        if begun == "on the way back":
+            back()
+        run = pool.submit(dim, 0.7) if begun == "first, waited for" else dim.start(0.7)
         if begun == "away":
-            run = dim.start(0.7)
             back()
-        else:
-            back()
-            run = dim.start(0.7)
-        wait_until(lambda: lamp.values == ([0.5] if lost == "call/" else [0.5, 0.7]))
+        if first:
+            wait_until(lambda: caller._parts.caller._clocks_due)
+        elif lost == "reply/":
+            wait_until(lambda: lamp.values == [0.5, 0.7])
         system.advance(1.0)
         assert not run.done()
         heal()
         system.advance(2.0)
-        assert run.result(20) == 0.7
-        assert lamp.values == [0.5, 0.7]
+        assert run.result(5) == 0.7
+        assert lamp.values == ([0.7] if first else [0.5, 0.7])
+
+
+def test_a_container_that_is_back_and_never_answers_is_asked_a_few_times_only() -> None:
+    with memory_system() as system:
+        system.container("b").register(Lamp(), "robot")
+        caller, dim = system.container("a"), found(system.container("a"))
+        dim(0.5)
+        asked = list[str]()
+        system.lose(lambda message: message.key.startswith("call/") and asked.append(message.key) is None)
+        caller._parts.caller.lost(dim.key.address, back=True)
+        system.advance(60.0)
+        assert len(asked) == 4
 
 
 def test_a_container_without_callers_is_not_asked_when_it_is_back() -> None:
