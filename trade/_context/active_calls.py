@@ -103,8 +103,6 @@ class KeptAnswer(Struct, gc=False):
     answer: Answer
     service: str
     """The service's name."""
-    size: int
-    """Bytes of the answer's body."""
 
 
 def end_calls(cancels: Sequence[Callable[[], object]]) -> None:
@@ -144,14 +142,14 @@ class CallDeduplicator:
         """Records a call; returns the earlier one if it is a repetition, which must not run again."""
         key = ongoing.caller, call.id
         with self._lock:
-            kept = self._kept.get(key)
-            if kept is not None:
-                return kept
-            found = self._running.setdefault(key, ongoing)
-            if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
+            found = self._find(key)
+            if found is not None:
+                return found
+            if self._evicted and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
                 ongoing.answer = _unknown(call.service)
-                del self._running[key]
-            return found
+            else:
+                self._running[key] = ongoing
+            return ongoing
 
     def find(self, caller: str, call: Call) -> ActiveCall | KeptAnswer | None:
         with self._lock:
@@ -177,8 +175,8 @@ class CallDeduplicator:
             self._running.pop(key, None)
             if keep:
                 now = time.monotonic_ns()
-                kept = self._bodies[key] = KeptAnswer(answer, call.service, len(answer[1]))
-                self._bytes += kept.size
+                kept = self._bodies[key] = KeptAnswer(answer, call.service)
+                self._bytes += len(answer[1])
                 self._drop_bodies()
                 self._keep(key, kept, call.expires_ns or now, now)
             return ongoing.also
@@ -189,7 +187,7 @@ class CallDeduplicator:
             found = self._find((caller, call_id))
             if found is None:
                 now = time.monotonic_ns()
-                self._keep((caller, call_id), KeptAnswer(cancelled(service), service, 0), now + int(keep_s * 1e9), now)
+                self._keep((caller, call_id), KeptAnswer(cancelled(service), service), now + int(keep_s * 1e9), now)
         if isinstance(found, ActiveCall) and found.answer is None:
             found.cancel()
 
@@ -201,7 +199,7 @@ class CallDeduplicator:
         """Drops the oldest answers until the others are small enough together."""
         while self._bytes > MOST_BYTES:
             _, oldest = self._bodies.popitem(last=False)
-            self._bytes -= oldest.size
+            self._bytes -= len(oldest.answer[1])
             oldest.answer = _unknown(oldest.service)
 
     def _keep(self, key: Key, kept: KeptAnswer, expires_ns: int, now_ns: int) -> None:
@@ -217,7 +215,7 @@ class CallDeduplicator:
             until_ns, key = heappop(self._until)
             self._kept.pop(key, None)
             if key in self._bodies:
-                self._bytes -= self._bodies.pop(key).size
+                self._bytes -= len(self._bodies.pop(key).answer[1])
             if until_ns >= now_ns:
                 self._note_evicted(*key)
 

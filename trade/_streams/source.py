@@ -146,7 +146,7 @@ class Source:
 
     def tick(self) -> int | None:
         """Sample the service if it has listeners; returns the time of the next tick."""
-        at, now = time.time(), time.monotonic_ns()
+        now = time.monotonic_ns()
         self.drop(lambda _, request: request.until_ns <= now)
         service = self._services(self._key)
         requested = {} if service is None else self._rates_requested()
@@ -156,9 +156,10 @@ class Source:
                 self._next_ns = 0
                 return None
             every_ns = period_ns(max(requested))
+            at, at_ns = time.time(), time.monotonic_ns()
             answer = self._sampled(service, now)
             for hz, how in requested.items():
-                self._rates[hz].offer(answer, at, now, how, every_ns)
+                self._rates[hz].offer(answer, at, at_ns, how, every_ns)
         except ChannelClosed:
             return None
         return self._after(now, every_ns)

@@ -31,17 +31,20 @@ def test_samples_come_in_order_with_the_time_they_were_taken_at(two: Two) -> Non
 
 def test_the_two_times_of_a_sample_are_of_one_moment(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first sample waits for its publisher. A recording adds the difference of its times to all later ones."""
-    transport = two.there._parts.transport
+    transport, made_ns = two.there._parts.transport, list[int]()
     publish = transport.publish
 
-    def slowly(*args: Any, **options: Any) -> Publisher:
-        time.sleep(0.5)
-        return publish(*args, **options)
+    def slowly(key: str, **options: Any) -> Publisher:
+        if key.startswith("stream/"):
+            time.sleep(0.5)
+            made_ns.append(time.monotonic_ns())
+        return publish(key, **options)
 
     monkeypatch.setattr(transport, "publish", slowly)
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as stream:
         first, *_, last = some(stream, 5)
     assert first.at - first.at_ns / 1e9 == pytest.approx(last.at - last.at_ns / 1e9, abs=0.25)
+    assert first.at_ns > made_ns[0]
 
 
 def test_a_service_without_listeners_is_not_polled(two: Two) -> None:
