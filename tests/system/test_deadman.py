@@ -88,6 +88,7 @@ def test_S05_a_joint_stops_no_later_where_calls_take_the_local_path(
             stop_delay_s(bench, run, "call", signal.SIGSTOP),
         )
 
+    monkeypatch.delenv("TRADE_LOCAL_PATH", raising=False)
     killed_s, left_s, frozen_s = delays_s()
     forked_s = stop_delay_s(bench, run, "forked", signal.SIGKILL)
     bench.driver.close()

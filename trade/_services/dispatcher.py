@@ -72,6 +72,7 @@ _MOST_WAITING: Final = 4096
 """Waiting calls of one identified caller."""
 _MOST_CALLERS: Final = 1024
 """Cached authorisations of one service."""
+_QUICK_NS: Final = 200_000
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
 _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
 """Our errors that are a provider's defect; a provider raises the others on purpose."""
@@ -179,12 +180,15 @@ class Dispatcher:
         """Whether a thread is ready to take the next call."""
         return all(pool.draining for pool in self.pools)
 
-    def serve(self, message: Message, hand_over: HandOver | None = None) -> None:
+    def serve(
+        self, message: Message, hand_over: HandOver | None = None, *, pass_on: Callable[[], None] | None = None
+    ) -> None:
         """Runs the call of a message, and answers it.
 
         Args:
             message: the call.
             hand_over: runs on another thread what is left to do when it has its answer; none: this thread does.
+            pass_on: lets another thread read the next message; none: one does already.
         """
         incoming = self._take(message)
         if incoming is None:
@@ -205,8 +209,14 @@ class Dispatcher:
             self._refuse(incoming, *failed(denied))
         elif urgent:
             self._answer(incoming, *_run(incoming, service, None))
-        else:
+        elif pass_on is None:
             self._begin(incoming, service, hand_over)
+        else:
+            if not service.quick:
+                pass_on()
+            began_ns = time.monotonic_ns()
+            self._begin(incoming, service, hand_over)
+            service.quick = time.monotonic_ns() - began_ns < _QUICK_NS
 
     def _begin(self, incoming: IncomingCall, service: LocalService, hand_over: HandOver | None) -> None:
         ongoing = ActiveCall(incoming.caller, incoming.call, partial(self._report, service))

@@ -21,6 +21,7 @@ from msgspec import Raw
 from trade._services.dispatcher import Dispatcher
 from trade._services.process_watch import ProcessWatch
 from trade._threads.channel_workers import MOST_THREADS, WorkerPool
+from trade._threads.quick_workers import QuickWorkerPool
 from trade.errors import TradeError
 from trade.protocol.keys import Address
 from trade.protocol.messages import Malformed
@@ -268,7 +269,7 @@ class LocalServer:
         dispatcher.answer_on(who, reply, replier)
         try:
             if greeting.shared:
-                self._share(LocalChannel(connection, keys), dispatcher.serve if greeting.stops else dispatcher.busy)
+                self._share(LocalChannel(connection, keys), stops=greeting.stops)
                 return
             while not self._closed:
                 raw, payload = connection.receive()
@@ -279,9 +280,13 @@ class LocalServer:
             dispatcher.answer_no_more(who, reply, replier)
             replier.end()
 
-    def _share(self, channel: LocalChannel, refuse: Callable[[Message], None]) -> None:
-        """Processes the calls of a shared connection on several threads. Raises Malformed."""
-        pool = WorkerPool("trade-local-call", channel, self._dispatcher.serve, refuse)
+    def _share(self, channel: LocalChannel, *, stops: bool) -> None:
+        """Processes the calls of a shared connection; no stop waits for another. Raises Malformed."""
+        name, serve = "trade-local-call", self._dispatcher.serve
+        if stops:
+            pool = WorkerPool(name, channel, serve, refuse=serve)
+        else:
+            pool = QuickWorkerPool(name, channel, serve, self._dispatcher.busy)
         self._dispatcher.pools.append(pool)
         if self._closed:  # meanwhile
             pool.close()

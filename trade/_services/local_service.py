@@ -39,6 +39,7 @@ class LocalService:
         "interceptors",
         "label",
         "method",
+        "quick",
         "resources",
         "serial",
         "signature",
@@ -73,6 +74,8 @@ class LocalService:
         """What may refuse its calls; the innermost, so that a stop meanwhile ends them."""
         self.admitted: dict[str, Policy] = {}
         """The identities that may call it, each with the policy that allowed it."""
+        self.quick = False
+        """Whether its last call took less time than to let another thread read the next one."""
         self._loop = loop
 
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:

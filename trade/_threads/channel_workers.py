@@ -50,7 +50,7 @@ class WorkerPool:
         self._threads: list[threading.Thread] = []
         self._spawned = 0
         self._idle = 0
-        self.taken = 0
+        self.taken: int = 0
         """The number of messages that it has begun to process, without refused ones."""
         self._closed = False
         with self._lock:

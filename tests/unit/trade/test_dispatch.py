@@ -4,6 +4,7 @@ import asyncio
 import gc
 import itertools
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -13,8 +14,9 @@ from trade import Container, Handle, Run, current_call, service, where
 from trade._services import dispatcher
 from trade._threads import channel_workers
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
-from trade.protocol.keys import LOCAL, Address, reply_key
-from trade.testing import memory_system
+from trade.protocol.keys import LOCAL, Address, call_key, reply_key
+from trade.protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, Call, encode_message
+from trade.testing import VirtualTime, memory_system
 from trade.transport.base import Channel, Message, Publisher
 from trade.transport.memory import MemoryTransport
 
@@ -368,6 +370,34 @@ def test_no_reply_key_is_kept_of_a_caller_that_is_gone(here: Container, there: C
     assert any("/here/" in key for key in repliers)
     here.close()
     wait_until(lambda: not any("/here/" in key for key in list(repliers)))
+
+
+def test_only_a_call_whose_service_was_quick_last_keeps_the_next_message_waiting(
+    here: Container, there: Container
+) -> None:
+    if VirtualTime.current() is None:
+        pytest.skip("it judges by moments: on the real clock, threads also wait for a processor")
+    order = list[str]()
+
+    class Press:
+        takes_s = 0.0
+
+        @service
+        def press(self) -> None:
+            order.append("pressed")
+            threading.Event().wait(self.takes_s)
+
+    machine = Press()
+    there.register(machine, "robot")
+    key = found(here, "press").key
+    path = call_key("tester", key.address, key.domain, key.provider, stop=False)
+    for number, machine.takes_s in enumerate([0.0, 0.0, 0.01, 0.0, 0.0]):
+        expires_ns, session, reply = time.monotonic_ns() + 10**10, "tester/there/1", "there/1"
+        call = Call(PROTOCOL, number + 1, "press", reply, session, expires_ns, (), EMPTY_ARGUMENTS)
+        message = Message(path, encode_message(call))
+        there._parts.dispatcher.serve(message, pass_on=lambda: order.append("next is read"))
+    read = "next is read"
+    assert order == [read, "pressed", "pressed", "pressed", read, "pressed", "pressed"]
 
 
 class _Hung(Publisher):

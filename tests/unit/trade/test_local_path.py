@@ -20,7 +20,7 @@ import pytest
 from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from tests.unit.trade.conftest import Gate
-from trade import Container, Handle, Resource, current_call, errors, service, where
+from trade import Container, Handle, Resource, Run, current_call, errors, service, where
 from trade._calls import local_path
 from trade._paths import runtime_folder
 from trade._resources.lock_table import LockTable
@@ -229,15 +229,35 @@ def test_started_calls_share_a_connection(here: Container, there: Container, add
     assert len(here._parts.local_path.slots) == 2  # and that of calls that are waited for
 
 
+def test_a_started_call_that_takes_longer_than_before_keeps_no_other_waiting(
+    here: Container, there: Container, add: Handle, gate: Gate
+) -> None:
+    there.register(gate, "gate")
+    enter = found(here, "pass_through")
+    gate.open.set()
+    assert {run.result(20) for run in [enter.start() for _ in range(50)]} == {"through"}
+    gate.open.clear()
+    inside = list[Run]()
+    for value in range(60):
+        behind = [add.start(value) for _ in range(10)]
+        if value % 3 == 0:
+            inside.append(enter.start())
+        assert [run.result(20) for run in behind] == [value + 1] * 10
+    wait_until(lambda: gate.runs == 50 + len(inside), "they are inside")
+    assert not any(run.done() for run in inside)
+    gate.open.set()
+    assert {run.result(20) for run in inside} == {"through"}
+
+
 @pytest.fixture
 def answers_then_hangs_up(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Names of services of locks: each answer to one is followed at once by the end of its connection."""
     last, named, ending = threading.local(), set[str](), set[int]()
     serve, send, receive = Dispatcher.serve, LocalReplier.put, LocalConnection.receive
 
-    def served(self: Dispatcher, message: Message, hand_over: Any = None) -> None:
+    def served(self: Dispatcher, message: Message, *args: Any, **kwargs: Any) -> None:
         last.service = decode_call(message.payload or b"").service
-        serve(self, message, hand_over)
+        serve(self, message, *args, **kwargs)
 
     def sent(self: LocalReplier, payload: bytes) -> None:
         if last.service not in named:
