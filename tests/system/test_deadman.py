@@ -78,8 +78,14 @@ def test_S03_a_motion_ends_with_any_session_on_whose_behalf_it_is(bench: Bench, 
     bench.stopped_short(ended_at, HALFWAY_RAD)
 
 
+@pytest.fixture
+def local_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What starts after this uses the local path, also where the whole run does not."""
+    monkeypatch.delenv("TRADE_LOCAL_PATH", raising=False)
+
+
 def test_S05_a_joint_stops_no_later_where_calls_take_the_local_path(
-    bench: Bench, run: Run, monkeypatch: pytest.MonkeyPatch
+    local_path: None, bench: Bench, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def delays_s() -> tuple[float, float, float]:
         return (
@@ -88,7 +94,6 @@ def test_S05_a_joint_stops_no_later_where_calls_take_the_local_path(
             stop_delay_s(bench, run, "call", signal.SIGSTOP),
         )
 
-    monkeypatch.delenv("TRADE_LOCAL_PATH", raising=False)
     killed_s, left_s, frozen_s = delays_s()
     forked_s = stop_delay_s(bench, run, "forked", signal.SIGKILL)
     bench.driver.close()

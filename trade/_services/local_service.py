@@ -75,7 +75,7 @@ class LocalService:
         self.admitted: dict[str, Policy] = {}
         """The identities that may call it, each with the policy that allowed it."""
         self.quick = False
-        """Whether its last call took less time than to let another thread read the next one."""
+        """Whether it took little time when it was last called on a connection for started calls."""
         self._loop = loop
 
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:

@@ -80,14 +80,17 @@ class WorkerPool:
             except ChannelClosed:
                 return
             left = self._leave_idle()
-            try:
-                (self._work if left else self._refuse)(message)
-            except ChannelClosed:
-                _logger.debug("no answer on %s: the container is closing", message.key)
-            except Exception:
-                _logger.exception("a call on %s could not be answered", message.key)
+            self._process(message, self._work if left else self._refuse)
             if left and not self._join_idle():
                 return
+
+    def _process(self, message: Message, work: Callable[[Message], None]) -> None:
+        try:
+            work(message)
+        except ChannelClosed:
+            _logger.debug("no answer on %s: the container is closing", message.key)
+        except Exception:
+            _logger.exception("a call on %s could not be answered", message.key)
 
     def _leave_idle(self) -> bool:
         """Whether this thread may run the call: another one must remain to take the next call."""

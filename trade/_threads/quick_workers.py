@@ -6,7 +6,6 @@ call takes longer than a moment, the watcher becomes the reader. A call that is 
 on before it runs, as every call does on other channels.
 """
 
-import logging
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -14,8 +13,6 @@ from typing import Final, Protocol
 
 from trade._threads.channel_workers import WorkerPool
 from trade.transport.base import Channel, ChannelClosed, Message
-
-_logger = logging.getLogger("trade")
 
 _LOOK_S: Final = 0.0005
 """How often the watcher looks. It takes over from a call that it sees twice."""
@@ -62,7 +59,10 @@ class QuickWorkerPool(WorkerPool):
             taken = self.taken
             if leaves:
                 self._reading.release()
-            self._process(message, number, refused=not (number or leaves))
+            if number:
+                self._process(message, partial(self._run, pass_on=partial(self._pass_on, number)))
+            else:
+                self._process(message, self._run if leaves else self._refuse)
             reads = self._still_reads(number) if number else not leaves
             watches = self.taken != taken  # calls come one after the other
             if not reads and not self._join_idle():
@@ -119,16 +119,3 @@ class QuickWorkerPool(WorkerPool):
                 return False
             self._own_call = 0
             return True
-
-    def _process(self, message: Message, number: int, *, refused: bool) -> None:
-        try:
-            if refused:
-                self._refuse(message)
-            elif number:
-                self._run(message, pass_on=partial(self._pass_on, number))
-            else:
-                self._run(message)
-        except ChannelClosed:
-            _logger.debug("no answer on %s: the container is closing", message.key)
-        except Exception:
-            _logger.exception("a call on %s could not be answered", message.key)

@@ -1,6 +1,7 @@
 """Containers in pairs, and programs in processes of their own that tests talk to over pipes."""
 
 import contextlib
+import queue
 import signal
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from trade import Container, Handle, service, where
 from trade._discovery.host_folder import HostFolder
 from trade.protocol.keys import ALIVE, alive_key
 from trade.testing import MemorySystem, memory_system
+from trade.transport.base import Channel, ChannelClosed, Message
 from trade.transport.credentials import user_secret
 from trade.transport.endpoints import free_endpoint
 from trade.transport.zenoh import ZenohTransport, configuration
@@ -286,3 +288,28 @@ def engine(here: Container, tmp_path: Path) -> Iterator[Engine]:
     yield made
     if made.running is not None:
         made.running.close()
+
+
+class QueueChannel(Channel):
+    """A channel into which a test puts messages."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+
+    def receive(self) -> Message:
+        message = self.waiting.get(timeout=60)
+        if message is None:
+            self.close()
+            raise ChannelClosed
+        return message
+
+    def close(self) -> None:
+        self.waiting.put(None)
+
+
+@pytest.fixture
+def channel() -> Iterator[QueueChannel]:
+    """Closed at the end of the test."""
+    made = QueueChannel()
+    yield made
+    made.close()

@@ -1,45 +1,23 @@
 """How many threads a channel of calls has."""
 
-import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from statistics import median
 
 import pytest
 
+from tests.unit.trade.conftest import QueueChannel
 from trade._threads.channel_workers import _MOMENT_S, MOST_THREADS, WorkerPool
 from trade.testing import VirtualTime
-from trade.transport.base import Channel, ChannelClosed, Message
+from trade.transport.base import Message
 
 pytestmark = pytest.mark.virtual_time
 
 CALL = Message("call/a/b", b"")
 
 
-class Queue(Channel):
-    def __init__(self) -> None:
-        self.waiting: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
-
-    def receive(self) -> Message:
-        message = self.waiting.get(timeout=60)
-        if message is None:
-            self.close()
-            raise ChannelClosed
-        return message
-
-    def close(self) -> None:
-        self.waiting.put(None)
-
-
-@pytest.fixture
-def channel() -> Iterator[Queue]:
-    made = Queue()
-    yield made
-    made.close()
-
-
-def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
+def test_very_many_quick_calls_are_taken_by_few_threads(channel: QueueChannel) -> None:
     done = threading.Semaphore(0)
     at_once: list[int] = []
 
@@ -59,7 +37,7 @@ def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
 
 
 def test_slow_calls_get_a_thread_each_which_ends_with_them(
-    channel: Queue, eventually: Callable[[Callable[[], bool]], bool]
+    channel: QueueChannel, eventually: Callable[[Callable[[], bool]], bool]
 ) -> None:
     inside, leave, refused = threading.Semaphore(0), threading.Event(), threading.Event()
 
@@ -82,7 +60,7 @@ def test_slow_calls_get_a_thread_each_which_ends_with_them(
 
 
 @pytest.mark.parametrize(("count", "most_s"), [(7, 0.0), (30, _MOMENT_S)])
-def test_slow_calls_that_come_together_begin_together(channel: Queue, count: int, most_s: float) -> None:
+def test_slow_calls_that_come_together_begin_together(channel: QueueChannel, count: int, most_s: float) -> None:
     """Seven joints of an arm that are started one by one: none waits for the ones before it."""
     if VirtualTime.current() is None:
         pytest.skip("on the real clock, threads also wait for a processor")
