@@ -12,6 +12,7 @@ _SEEDS = (1, 2, 3)
 
 
 @pytest.mark.mutant
+@pytest.mark.realtime
 @pytest.mark.timeout(2000)
 @pytest.mark.parametrize("mutant", MINUTES)
 def test_a_siege_detects_a_broken_driver(mutant: str) -> None:
