@@ -78,9 +78,28 @@ def test_established_links_do_not_count_as_strangers(door: socket.socket, dial: 
     guard = PortGuard([port], links)
     try:
         assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
-        before = looked[0]
-        wait_until(lambda: looked[0] > before + 2)
+        wait_until(lambda: looked[0] > 0)
         assert dial(port)
+    finally:
+        guard.close()
+
+
+@pytest.mark.parametrize("links", [0, 1])
+def test_the_connections_are_inspected_again_only_while_some_are_no_links(
+    door: socket.socket, dial: Callable[[int], bool], links: int
+) -> None:
+    port, looked = door.getsockname()[1], [0]
+
+    def count() -> int:
+        looked[0] += 1
+        return links
+
+    assert dial(port)
+    guard = PortGuard([port], count)
+    try:
+        wait_until(lambda: looked[0] > 0)
+        time.sleep(2.0)
+        assert looked[0] == 1 if links else looked[0] > 3
     finally:
         guard.close()
 
