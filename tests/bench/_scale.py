@@ -169,7 +169,7 @@ def measure(size: int, whole: int | None = None) -> Seen:
         _settle(system)
         register = count.since()
         pattern._parts.announcer._quiet = 0
-        pattern._parts.announcer.beat()
+        pattern._parts.announcer.beat(2)
         beat = count.since()
         estop = _estop(system, late, count) if not stand_ins else None
         find_us = _median_us(

@@ -53,7 +53,7 @@ class StandIn:
         self._thread = threading.Thread(target=self._read, name="stand-in", daemon=True)
         self._presence = self._announcer.appear()
         if asks:
-            self._transport.ask(REGISTRY, _ANSWER_S)
+            self._transport.ask([REGISTRY], _ANSWER_S)
         self._thread.start()
 
     def ask_from_now_on(self) -> None:
@@ -62,7 +62,7 @@ class StandIn:
 
     def beat(self) -> None:
         """What a container does every two seconds."""
-        self._announcer.beat()
+        self._announcer.beat(len(self._known))
 
     def _read(self) -> None:
         while True:
@@ -77,7 +77,7 @@ class StandIn:
         new = sign.payload is not None and sign.key not in self._known and address != self.address
         self._known.add(sign.key)
         if new and self._asks:
-            self._transport.ask(registry_key("*", address, "*"), _ANSWER_S)
+            self._transport.ask([registry_key("*", address, "*")], _ANSWER_S)
 
     def close(self) -> None:
         """Leave."""

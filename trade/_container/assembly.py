@@ -26,6 +26,7 @@ from trade._discovery.announcer import Announcer
 from trade._discovery.dialer import Dialer
 from trade._discovery.join import join
 from trade._discovery.listener import RegistryListener
+from trade._discovery.resync import introduction_s
 from trade._estop.controller import EstopController, is_stop
 from trade._federation.federation import Federation
 from trade._hooks.api import HookApi
@@ -72,7 +73,7 @@ from trade.protocol.container_info import ContainerInfo
 from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey, bridge_key
 from trade.protocol.messages import Token
 from trade.stop_line import RelayedEstop, StopApi, StopLines, StopLineService
-from trade.transport.base import Transport
+from trade.transport.base import ChannelClosed, Transport
 from trade.transport.credentials import keep_secret, user_secret
 from trade.transport.host_socket import host_sockets, listen_on_host
 from trade.transport.local_greeting import Passport
@@ -396,6 +397,10 @@ class Components:
                 self._real_timers,
             )
             self._leaving.callback(self.watch.close)
+            if self.transport.relayed:
+                at_s = self._real_timers.clock.now() + introduction_s(self.registry)
+                self._leaving.callback(self._real_timers.begin(self._introduce, at_s * 1e9).cancel)
+            self.watch.sync()
             if self.access.path is not None:
                 begin_watching(self.access, self.scheduler, self.audit, self.recheck_access)
             undone.pop_all()
@@ -407,9 +412,13 @@ class Components:
         if self.stop_line is not None and any(record.local and is_stop(record) for record in change.joined):
             self.stop_line.listen_on_host()
 
+    def _introduce(self) -> None:
+        with contextlib.suppress(ChannelClosed):
+            self.announcer.introduce()
+
     def _beat(self) -> None:
         """Announces the revision if it is due, and looks at the links; called every two seconds."""
-        self.announcer.beat()
+        self.announcer.beat(len(self.registry.containers()))
         self.states.links.infos()
         self._keep_files()
 

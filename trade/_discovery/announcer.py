@@ -12,13 +12,15 @@ _logger = logging.getLogger("trade")
 
 SELDOM: Final = 8
 """A container with no news announces its revision every this many beats."""
+_MOST_A_BEAT: Final = 4
+"""Among many containers it does so less often: each of them receives at most this many revisions in a beat."""
 
 
 class Announcer:
     """Owns the current announcements. One thread announces at a time; its own thread answers queries.
 
     Each announcement has the next revision number, whatever provider it is about, so a container that misses one can
-    query for it. Nothing is sent before `appear`: no container would take it, and all of them query at that moment.
+    query for it. Nothing is sent before `appear`: no container would take it. Without a hub, all query it then anyway.
     """
 
     def __init__(self, transport: Transport, own: Address) -> None:
@@ -35,13 +37,26 @@ class Announcer:
         self._thread.start()
 
     def appear(self) -> Presence:
-        """Publish the container's sign of life, and send all later announcements to the other containers.
+        """Publish the container's sign of life, and send all later announcements, or those from `introduce` on.
 
         Raises:
             ChannelClosed: the transport was closed.
         """
-        self._is_announced = True
+        self._is_announced = not self._transport.relayed
         return self._transport.appear(alive_key(self._own))
+
+    def introduce(self) -> None:
+        """Announce all that there is, and the revision: who hears all of it needs no query.
+
+        Raises:
+            ChannelClosed: the transport was closed.
+        """
+        with self._lock:
+            self._is_announced = True
+            current, revision = list(self._current.items()), self._revision
+        for key, payload in current:
+            self._transport.announce(key, payload)
+        self._transport.announce(tally_key(self._own), encode_message(Tally(PROTOCOL, revision)))
 
     def announce(self, domain: str, provider: str, info: ProviderInfo) -> None:
         """Announce a provider to all containers, or its end if it has no services.
@@ -56,14 +71,18 @@ class Announcer:
                 self._current[key] = payload
             else:
                 self._current.pop(key, None)
-        if self._is_announced:
+            is_announced = self._is_announced
+        if is_announced:
             self._transport.announce(key, payload)
 
-    def beat(self) -> None:
+    def beat(self, containers: int) -> None:
         """Announce the current revision if it is due, for containers that missed the last announcement.
 
         It is due at the first beat after an announcement, the second, the fourth and so on, then at every eighth
-        (`SELDOM`): as all containers receive it, the traffic grows with the square of their number.
+        (`SELDOM`), or less often among many: all containers receive it.
+
+        Args:
+            containers: how many this one knows.
 
         Raises:
             ChannelClosed: the transport was closed.
@@ -71,7 +90,8 @@ class Announcer:
         with self._lock:
             self._quiet += 1
             quiet, revision = self._quiet, self._revision
-        if quiet % SELDOM == 0 or (quiet < SELDOM and quiet.bit_count() == 1):
+        seldom = max(SELDOM, containers // _MOST_A_BEAT)
+        if quiet % seldom == 0 or (quiet < seldom and quiet.bit_count() == 1):
             self._transport.announce(tally_key(self._own), encode_message(Tally(PROTOCOL, revision)))
 
     def _answer_all(self) -> None:

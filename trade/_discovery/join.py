@@ -17,6 +17,7 @@ from trade.hub_file import HubFile
 from trade.transport.credentials import user_secret
 from trade.transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
 from trade.transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
+from trade.transport.precedence import precedence
 from trade.transport.zenoh import ZenohTransport, configuration
 from trade.transport.zenoh_links import Links
 
@@ -76,7 +77,9 @@ def _join(
     anywhere_here = Endpoint("tcp" if certificate is None else "tls", "127.0.0.1", 0)
     wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
     if settings.hub == "serve":
-        return _serve(settings, certificate, wanted, networks, leaving)
+        # Of many containers that compute at the same time, each would get as much of a processor as the hub of all.
+        with precedence("the hub"):
+            return _serve(settings, certificate, wanted, networks, leaving)
     return _join_anywhere(settings, certificate, wanted, networks, leaving)
 
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from trade._registry.registry import ContainerState, Registry
 from trade._threads.scheduler import NEVER, Scheduler
-from trade.protocol.keys import REGISTRY, Address, registry_key
+from trade.protocol.keys import Address, registry_key
 from trade.transport.base import Answer, ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
@@ -21,9 +21,20 @@ _SLOW_ANSWER_S: Final = 10.0
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0
 """Between two queries to a container that is alive and does not reply, or announces nonsense."""
+_AT_ONCE: Final = 16
+"""The most containers that are queried at the same time: what all have is megabytes, and a hub that cannot pass them on
+at once passes nothing else on meanwhile."""
+_INTRODUCTION_S: Final = 0.00125
+"""For each known container: how long after its sign of life one behind a hub announces all that it has. Others query it
+only after twice this time, if they missed some: it cannot answer all of them while it reads what they offer."""
 _END_S: Final = 2.0
 
 Take = Callable[[Answer, dict[Address, ContainerState]], None]
+
+
+def introduction_s(registry: Registry) -> float:
+    """How long after its sign of life a container behind a hub announces all that it has, by what this one knows."""
+    return _INTRODUCTION_S * len(registry.containers())
 
 
 class Resynchronizer:
@@ -84,8 +95,15 @@ class Resynchronizer:
             if appeared:
                 self._due.pop(address, None)
                 self._forget(address)
-            self._due.setdefault(address, self._clock.now() + self._pauses.get(address, 0.0))
+            first_s = 2 * introduction_s(self._registry) if appeared and self._introduce_themselves else 0.0
+            pause_s = self._pauses.get(address, first_s)
+            self._due.setdefault(address, self._clock.now() + pause_s)
         self._remind()
+
+    @property
+    def _introduce_themselves(self) -> bool:
+        """Whether containers that appear now announce all that they have."""
+        return self._transport.relayed and self._started
 
     @property
     def busy(self) -> bool:
@@ -134,21 +152,15 @@ class Resynchronizer:
     def _ask(self, due: list[Address], slow: bool) -> None:
         alive = {state.address: state for state in self._registry.containers()}
         open_ones = [address for address in due if address in alive and not alive[address].heard.complete]
-        if not slow and 2 * len(open_ones) > len(alive):
-            self._ask_with(REGISTRY, alive, open_ones, _ANSWER_S)
-        else:
-            for address in open_ones:
-                pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
-                self._ask_with(pattern, alive, [address], patience_s)
+        for first in range(0, len(open_ones), _AT_ONCE):
+            self._ask_these(open_ones[first : first + _AT_ONCE], alive, _SLOW_ANSWER_S if slow else _ANSWER_S)
         with self._changed:
             for address in set(due).difference(open_ones):
                 self._forget(address)
 
-    def _ask_with(
-        self, pattern: str, alive: dict[Address, ContainerState], asked: Sequence[Address], patience_s: float
-    ) -> None:
+    def _ask_these(self, asked: Sequence[Address], alive: dict[Address, ContainerState], patience_s: float) -> None:
         before, began = {address: alive[address].heard.answered for address in asked}, time.monotonic()
-        answers = self._transport.ask(pattern, patience_s)
+        answers = self._transport.ask([registry_key("*", address, "*") for address in asked], patience_s)
         in_vain = time.monotonic() - began >= _ANSWER_S
         for answer in answers:
             try:

@@ -52,7 +52,7 @@ class LossConformance(ABC):
             del standing["shop/49"]
             reconnect()
             assert lost.returns()
-            [answer] = other.ask("shop/**", PATIENCE_S)
+            [answer] = other.ask(["shop/**"], PATIENCE_S)
             assert answer.messages == [Message(f"shop/{number}", b"1") for number in range(49)]
 
     def test_who_is_lost_amid_a_question_is_not_waited_for(self) -> None:
@@ -60,7 +60,7 @@ class LossConformance(ABC):
             questions = one.questions("shop/*")
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
-                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                asked = pool.submit(other.ask, ["shop/*"], 3600.0)
                 question = questions.receive()
                 sever()
                 assert asked.result(2 * PATIENCE_S) == []

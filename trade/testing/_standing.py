@@ -70,7 +70,7 @@ class StandingConformance(ABC):
             _signs = one.appear("alive/one"), other.appear("alive/other")
             late = open_transport()
             _wait_for(late, 2)
-            answers = late.ask("shop/**", PATIENCE_S)
+            answers = late.ask(["shop/**"], PATIENCE_S)
             assert sorted([(message.key, message.payload) for message in answer.messages] for answer in answers) == [
                 [("shop/one/bread", b"fresh"), ("shop/one/milk", b"cold")],
                 [("shop/other/eggs", b"12")],
@@ -84,7 +84,7 @@ class StandingConformance(ABC):
                 RegistryResponder(one, f"shop-{turn}/*", {f"shop-{turn}/bread": b"fresh"})
                 sign = one.appear(f"alive/{turn}")
                 signs.until(f"alive/{turn}", b"")
-                [answer] = other.ask(f"shop-{turn}/*", PATIENCE_S)
+                [answer] = other.ask([f"shop-{turn}/*"], PATIENCE_S)
                 assert answer.messages == [Message(f"shop-{turn}/bread", b"fresh")]
                 sign.close()
 
@@ -93,7 +93,7 @@ class StandingConformance(ABC):
             standing = {f"shop/{number}": str(number).encode() * 100 for number in range(10_000)}
             RegistryResponder(one, "shop/*", standing)
             meet(listener=one, speaker=other)
-            [answer] = other.ask("shop/**", 6 * PATIENCE_S)
+            [answer] = other.ask(["shop/**"], 6 * PATIENCE_S)
             assert [(message.key, message.payload) for message in answer.messages] == list(standing.items())
 
     def test_only_the_requested_entries_are_sent_by_the_members_that_were_asked(self) -> None:
@@ -101,20 +101,33 @@ class StandingConformance(ABC):
             RegistryResponder(one, "shop/*/one/*", {"shop/food/one/bread": b"fresh", "shop/tools/one/saw": b"sharp"})
             RegistryResponder(one, "bank/*", {"shop/food/one/poison": b"", "bank/money": b"1"})
             meet(listener=one, speaker=other)
-            [answer] = other.ask("shop/food/one/*", PATIENCE_S)
+            [answer] = other.ask(["shop/food/one/*"], PATIENCE_S)
             assert answer.messages == [Message("shop/food/one/bread", b"fresh")]
+
+    def test_what_a_member_replies_to_several_queries_is_one_answer(self) -> None:
+        with self.network() as open_transport:
+            one, other, late = (open_transport() for _ in range(3))
+            RegistryResponder(one, "shop/*", {"shop/bread": b"fresh", "shop/milk": b"cold", "shop/salt": b"1"})
+            RegistryResponder(other, "bank/*", {"bank/money": b"1"})
+            _signs = one.appear("alive/one"), other.appear("alive/other")
+            _wait_for(late, 2)
+            answers = late.ask(["shop/bread", "bank/*", "shop/milk"], PATIENCE_S)
+            assert sorted([message.key for message in answer.messages] for answer in answers) == [
+                ["bank/money"],
+                ["shop/bread", "shop/milk"],
+            ]
 
     def test_no_member_queries_itself(self) -> None:
         with self.pair() as (one, _):
             RegistryResponder(one, "shop/*", {"shop/bread": b"fresh"})
-            assert one.ask("shop/**", PATIENCE_S) == []
+            assert one.ask(["shop/**"], PATIENCE_S) == []
 
     def test_a_question_that_is_not_ended_ends_at_its_deadline_with_what_was_said(self) -> None:
         with self.pair() as (one, other):
             questions = one.questions("shop/*")
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
-                asked = pool.submit(other.ask, "shop/*", 1.0)
+                asked = pool.submit(other.ask, ["shop/*"], 1.0)
                 question = questions.receive()
                 question.answer("shop/bread", b"fresh")
                 [answer] = asked.result(PATIENCE_S)
@@ -126,7 +139,7 @@ class StandingConformance(ABC):
             questions = one.questions("shop/*")
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
-                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                asked = pool.submit(other.ask, ["shop/*"], 3600.0)
                 question = questions.receive()
                 one.close()
                 assert asked.result(PATIENCE_S) == []
@@ -137,7 +150,7 @@ class StandingConformance(ABC):
             questions = one.questions("shop/*")
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
-                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                asked = pool.submit(other.ask, ["shop/*"], 3600.0)
                 question = questions.receive()
                 other.close()
                 with contextlib.suppress(ChannelClosed):
@@ -149,7 +162,7 @@ class StandingConformance(ABC):
             questions, refused = one.questions("shop/*"), False
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
-                asked = pool.submit(other.ask, "shop/*", PATIENCE_S)
+                asked = pool.submit(other.ask, ["shop/*"], PATIENCE_S)
                 question = questions.receive()
                 question.close()
                 question.close()
@@ -164,11 +177,11 @@ class StandingConformance(ABC):
         with self.pair() as (one, other):
             teller = RegistryResponder(one, "shop/*", {"shop/bread": b"fresh"})
             meet(listener=one, speaker=other)
-            assert len(other.ask("shop/*", PATIENCE_S)) == 1
+            assert len(other.ask(["shop/*"], PATIENCE_S)) == 1
             teller.questions.close()
             teller.questions.close()
             meet(listener=one, speaker=other)
-            assert other.ask("shop/*", PATIENCE_S) == []
+            assert other.ask(["shop/*"], PATIENCE_S) == []
 
     # --- presence
 

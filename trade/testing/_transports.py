@@ -219,7 +219,7 @@ class TransportConformance(StandingConformance):
             "announce": lambda closed: closed.announce("room/a", b"1"),
             "announcements": lambda closed: closed.announcements("room/**"),
             "questions": lambda closed: closed.questions("room/**"),
-            "ask": lambda closed: closed.ask("room/**", 1.0),
+            "ask": lambda closed: closed.ask(["room/**"], 1.0),
             "appear": lambda closed: closed.appear("alive/one"),
             "presences": lambda closed: closed.presences("alive/**"),
             "present": lambda closed: closed.present("alive/**", 1.0),

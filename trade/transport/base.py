@@ -5,6 +5,7 @@ same on any implementation; ``zenoh`` is the real one.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from msgspec import Raw, Struct
 
@@ -109,6 +110,8 @@ class Transport(ABC):
 
     clock: WaitClock = WaitClock()
     """The clock of long waits."""
+    relayed: bool = False
+    """Whether its one link is to a hub that relays everything."""
     beat_s: float = 2.0
     """The interval at which a container announces its revision, and so the longest time a loss stays unnoticed."""
 
@@ -147,10 +150,11 @@ class Transport(ABC):
         """Receive the queries for keys that match."""
 
     @abstractmethod
-    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
+    def ask(self, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
         """Query all other transports at once; returns their replies when all are done or the timeout has passed.
 
-        A transport that is lost meanwhile is not waited for.
+        A transport that is lost meanwhile is not waited for. Each pattern is a query of its own;
+        what one transport replies to all of them is one answer.
         """
 
     @abstractmethod

@@ -7,9 +7,10 @@ for a stalled receiver instead of dropping (zenoh's default). All sessions have 
 """
 
 import contextlib
+import itertools
 import logging
 import threading
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -269,6 +270,7 @@ class ZenohTransport(Transport):
         if self._prompt is not None and not self._prompt.secure():
             _logger.warning("the transport cannot be made to dial: containers whose addresses change may stay unlinked")
         self.links: Final = Links(self._session, settings, self._prompt)
+        self.relayed = bool(self.links.hub)
         self.keep_files: Callable[[], None] = lambda: None
         """Writes files on this host again, by which others find this transport, if they have vanished."""
         self._publishers: Final[set[zenoh.Publisher]] = set()
@@ -329,24 +331,21 @@ class ZenohTransport(Transport):
         with _refusing():
             return ZenohQuestions(self._session.declare_queryable(pattern, _fifo()))
 
-    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
+    def ask(self, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
         with _refusing():
-            replies = self._session.get(
-                pattern,
-                _fifo(),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=_BLOCK,
-                allowed_destination=zenoh.Locality.REMOTE,
-                timeout=timeout_s,
-            )
-        answers: dict[str, Answer] = {}
-        for reply in replies:
-            if reply.ok is not None:
-                who = "" if reply.replier_id is None else str(reply.replier_id.zid)
-                answer = answers.setdefault(who, Answer(who, []))
-                answer.messages.append(Message(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
-        return list(answers.values())
+            queries = [self._query(pattern, timeout_s) for pattern in patterns]
+        return _by_replier(itertools.chain.from_iterable(queries))
+
+    def _query(self, pattern: str, timeout_s: float) -> Iterable[zenoh.Reply]:
+        return self._session.get(
+            pattern,
+            _fifo(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=_BLOCK,
+            allowed_destination=zenoh.Locality.REMOTE,
+            timeout=timeout_s,
+        )
 
     def appear(self, key: str) -> Presence:
         with _refusing():
@@ -376,6 +375,16 @@ class ZenohTransport(Transport):
         _quietly(self._session.close)
         if self._prompt is not None:
             self._prompt.close()
+
+
+def _by_replier(replies: Iterable[zenoh.Reply]) -> list[Answer]:
+    answers: dict[str, Answer] = {}
+    for reply in replies:
+        if reply.ok is not None:
+            who = "" if reply.replier_id is None else str(reply.replier_id.zid)
+            answer = answers.setdefault(who, Answer(who, []))
+            answer.messages.append(Message(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+    return list(answers.values())
 
 
 def _fifo() -> Any:

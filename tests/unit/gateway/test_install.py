@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 from typer.testing import CliRunner, Result
 
 from tests.support.simulated_robots import HEAD
@@ -17,6 +18,7 @@ from trade_drivers import load
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.operation import _install
+from trade_gateway.cli.operation._file_closure import named_files
 from trade_gateway.cli.operation._install import _closed_to
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, HostResources, needs_of, unit_text
 
@@ -270,6 +272,27 @@ def test_only_a_unit_with_drivers_may_run_in_real_time() -> None:
     assert said_of(alone, "SystemCallFilter")[-1] == "~@privileged @resources"
 
 
+def test_only_the_unit_of_a_hub_may_precede_others() -> None:
+    text = a_unit(HostResources(real_time=True, hub=True))
+    assert said_of(text, "LimitNICE") == ["-10"]
+    assert said_of(text, "SystemCallFilter")[-1] == "sched_setscheduler setpriority"
+    assert said_of(text, "LimitRTPRIO") == ["10"]
+    alone = a_unit(HostResources(hub=True))
+    assert (said_of(alone, "LimitNICE"), said_of(alone, "RestrictRealtime")) == (["-10"], ["yes"])
+    assert said_of(a_unit(), "LimitNICE") == []
+
+
+@pytest.mark.parametrize("where", ["gateway", "inner"])
+def test_a_hub_is_found_in_the_gateway_file_and_in_those_that_it_runs(tmp_path: Path, where: str) -> None:
+    lines = {"gateway": "", "inner": "", where: "hub = true\n"}
+    (tmp_path / "inner.toml").write_text(f'system = "lab"\n{lines["inner"]}')
+    outer = tmp_path / "outer.toml"
+    outer.write_text(f'system = "lab"\n{lines["gateway"]}[container.door]\ngateway = "inner.toml"\n')
+    assert named_files(outer).hub
+    (tmp_path / "inner.toml").write_text('system = "lab"\n')
+    assert named_files(tmp_path / "inner.toml").hub is False
+
+
 def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:
     alone, several = (int(said_of(a_unit(containers=count), "TimeoutStopSec")[0]) for count in (0, 3))
     assert several == 4 * alone
@@ -280,7 +303,7 @@ def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:
 @pytest.mark.parametrize("robots", [[], ["rosie.toml"]], ids=["a gateway", "a robot's computer"])
 def test_systemd_takes_the_unit_and_finds_it_exposed_little(tmp_path: Path, robots: list[str]) -> None:
     made = tmp_path / "trade-gateway.service"
-    needs = needs_of(load(EXAMPLES / robot) for robot in robots)
+    needs = structs.replace(needs_of(load(EXAMPLES / robot) for robot in robots), hub=True)
     made.write_text(a_unit(needs, program=[sys.executable], folders=[Path("/home/anna/trade")]))
     verified = analyze("verify", "--man=no", str(made))
     assert (verified.returncode, verified.stderr) == (0, "")

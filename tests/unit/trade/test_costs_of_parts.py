@@ -349,7 +349,7 @@ def test_join_heartbeat_and_shutdown_have_a_bounded_cost_per_container(
     assert heard.bytes <= MOST_BYTES_OF_A_JOIN * containers
     heard.bytes = 0
     with heard.exactly(announce=containers):
-        late._parts.announcer.beat()
+        late._parts.announcer.beat(2)
     assert heard.bytes <= MOST_BYTES_OF_A_BEAT * containers
     heard.bytes = 0
     late.close()

@@ -1,7 +1,9 @@
 """The hub of a host: containers that start after it have one link, to it, and work together as before."""
 
 import os
+import resource
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from tests.unit.trade.conftest import StartProgram
 from trade import Container, Resource, Settings, permit, service, where
 from trade.errors import CannotConnect, ConfigurationError, LockedByOther, NoSuchService
 from trade.hub_file import HubFile
+from trade.transport.precedence import NICE
 from trade.transport.zenoh import ZenohTransport
 from trade.transport.zenoh_links import Links
 
@@ -121,6 +124,36 @@ def test_calls_between_attached_containers_do_not_pass_through_the_hub(
         tapped.recv()  # which waits: the hub may pass a call on before its own tap has it
     assert tapped.try_recv() is None or passes
     tapped.undeclare()
+
+
+def test_a_container_that_attaches_knows_all_others_at_once(hub: Container, start_container: StartContainer) -> None:
+    names = [f"c{number}" for number in range(8)]
+    for name in names:
+        start_container(name).register(Joint(), f"of.{name}")
+    late = start_container("late")
+    assert {info.name for info in late.containers()} == {"hub", "late", *names}
+    assert len(late.services(where(name="move", kind="Joint"))) == len(names)
+
+
+@pytest.mark.realtime
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have a nice value of their own on Linux only")
+def test_the_threads_of_a_hub_precede_those_of_its_containers(start_program: StartProgram) -> None:
+    def begun(program: str) -> Path:
+        started = start_program(program)
+        assert started.heard() == "up"
+        return Path(f"/proc/{started.process.pid}/task")
+
+    def nice(tasks: Path) -> dict[str, int]:
+        return {
+            (task / "comm").read_text().strip(): os.getpriority(os.PRIO_PROCESS, int(task.name))
+            for task in tasks.iterdir()
+        }
+
+    hub, attached = map(nice, [begun(HUB), begun(ATTACHED)])
+    sending = next(name for name in hub if name.startswith("tx"))
+    allowed = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_NICE)[0] >= 20 - NICE
+    assert (hub[sending], hub["python"]) == (NICE if allowed else 0, 0)
+    assert set(attached.values()) == {0}
 
 
 def test_samples_and_signs_of_life_pass_through_the_hub(
@@ -276,6 +309,11 @@ HUB = """
 with Container(Settings.read(container="hub", hub="serve")):
     say("up")
     hear()
+"""
+ATTACHED = """
+trade.container()
+say("up")
+hear()
 """
 OWNER = """
 import threading

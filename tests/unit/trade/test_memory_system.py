@@ -203,17 +203,28 @@ def test_a_joining_container_is_informed_by_answers_only(lamp: Lamp) -> None:
         assert system.sent(MessageKind.ANNOUNCE) == before + 1
 
 
-def test_an_unchanged_container_reports_its_revision_ever_less_often(lamp: Lamp) -> None:
+@pytest.mark.parametrize(
+    ("known", "beats"),
+    [
+        (2, [1, 2, 4, 8, 16, 24, 32]),
+        (35, [1, 2, 4, 8, 16, 24, 32]),
+        (40, [1, 2, 4, 8, 10, 20, 30]),
+        (1000, [1, 2, 4, 8, 16, 32]),
+    ],
+)
+def test_an_unchanged_container_reports_its_revision_ever_less_often_and_seldom_among_many(
+    lamp: Lamp, known: int, beats: list[int]
+) -> None:
     with memory_system() as system:
         system.container("a")
         b = system.container("b")
         announcer = b._parts.announcer
 
         def beats_that_tell(count: int) -> list[int]:
-            return [beat for beat in range(1, count + 1) if _sends_one(system, announcer.beat)]
+            return [beat for beat in range(1, count + 1) if _sends_one(system, partial(announcer.beat, known))]
 
         b.register(lamp, "robot")
-        assert beats_that_tell(33) == [1, 2, 4, 8, 16, 24, 32]
+        assert beats_that_tell(33) == beats
         b.deregister(lamp)
         assert beats_that_tell(3) == [1, 2]
 

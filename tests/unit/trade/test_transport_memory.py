@@ -253,12 +253,12 @@ def test_a_container_that_is_cut_off_answers_until_it_is_lost(room: Room) -> Non
     room.one.questions("shop/*")
     room.cut(one_way=True)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(room.other.ask, "shop/*", 20)
+        asked = pool.submit(room.other.ask, ["shop/*"], 20)
         tell(room.one, "shop/bread", b"fresh")
         [answer] = asked.result()
     assert answer.messages == [Message("shop/bread", b"fresh")]
     room.network.clock.advance(2)
-    assert room.other.ask("shop/*", 20) == []
+    assert room.other.ask(["shop/*"], 20) == []
     assert room.other.present("alive/**", 0) == []
 
 

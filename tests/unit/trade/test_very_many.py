@@ -64,7 +64,7 @@ def test_lost_entries_are_requested_when_the_container_reports_its_revision(
         lossy.setattr(host._transport, "announce", lambda key, payload: None)
         host.announce("panels", "p2", entry(2, 1))
         host.announce("panels", "p1", entry(3, 0))
-    host.beat()
+    host.beat(2)
     assert eventually(lambda: [handle.key.provider for handle in here.services(where(group="panels"))] == ["p2"])
 
 

@@ -5,7 +5,7 @@ import math
 import random
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -193,12 +193,13 @@ class Network:
             for target in self._others(source):
                 self.pass_on(MessageKind.FALL, source, target, Message(key, None), _losing(target, token))
 
-    def ask(self, source: Node, pattern: str, timeout_s: float) -> list[Answer]:
+    def ask(self, source: Node, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
         """Query all others; wait, by the real clock, until all that are not lost have replied."""
         with self.lock:
             _check_open(source)
             questions = [
                 _Query(self, source, target, pattern, asked)
+                for pattern in patterns
                 for target in self._others(source)
                 for asked in target.asked
                 if meet(pattern, asked.pattern)
@@ -207,7 +208,12 @@ class Network:
                 question.send()
             self.changed.wait_for(lambda: source.closed or all(question.ended for question in questions), timeout_s)
             _check_open(source)
-            return [question.collected for question in questions if question.collected.messages]
+            answers: dict[Node, Answer] = {}
+            for question in questions:
+                if question.collected.messages:
+                    answer = answers.setdefault(question.target, Answer(question.collected.who, []))
+                    answer.messages.extend(question.collected.messages)
+            return list(answers.values())
 
     def linked(self, one: Node, other: Node) -> bool:
         """Whether a link between two open nodes is up."""
@@ -337,7 +343,7 @@ class _Query(Question):
         self.collected = Answer(f"{target.name}-{network.next_number()}", [])
         self._network = network
         self._source = source
-        self._target = target
+        self.target = target
         self._pattern = pattern
         self._queryable = queryable
         self._closed = False
@@ -346,13 +352,13 @@ class _Query(Question):
         """Send the query. Used under the network's lock."""
         message = Message(self._pattern, None)
         self._network.pass_on(
-            MessageKind.ASK, self._source, self._target, message, lambda: self._queryable.take(self), at_once=True
+            MessageKind.ASK, self._source, self.target, message, lambda: self._queryable.take(self), at_once=True
         )
 
     @property
     def ended(self) -> bool:
         """Whether no more replies will come; used under the network's lock."""
-        return self._closed or not self._network.linked(self._source, self._target)
+        return self._closed or not self._network.linked(self._source, self.target)
 
     def answer(self, key: str, payload: bytes) -> None:
         with self._network.lock:
@@ -362,7 +368,7 @@ class _Query(Question):
                 message = Message(key, payload)
                 self._network.pass_on(
                     MessageKind.ANSWER,
-                    self._target,
+                    self.target,
                     self._source,
                     message,
                     lambda: self.collected.messages.append(message),

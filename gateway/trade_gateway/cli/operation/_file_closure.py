@@ -29,6 +29,8 @@ class NamedFiles(NamedTuple):
     """The ids of its systems, its own first."""
     containers: int
     """The number of containers on this host besides the gateway."""
+    hub: bool
+    """Whether it, or a gateway among those, is the hub of this host."""
 
 
 class _Http(Struct):
@@ -48,6 +50,7 @@ class _Part(Struct, kw_only=True):
     ros: str = ""
     http: _Http | None = None
     gateway: str = ""
+    hub: bool = False
     host: str = _LOCAL
 
     def files(self, folder: Path) -> Iterator[Path]:
@@ -95,7 +98,7 @@ def named_files(path: Path) -> NamedFiles:
     own = file.system if isinstance(file.system, _System) else _System(name=file.system)
     containers = [part for part in file.container.values() if part.host == _LOCAL]
     files, robots, records = [path], list[Path](), list[Path]()
-    systems = [own.name, *(share.system for share in file.share.values())]
+    systems, hub = [own.name, *(share.system for share in file.share.values())], file.hub
     for part in (file, own, *file.share.values(), *containers):
         files += part.files(path.parent)
         robots += [path.parent / part.robot] if part.robot else []
@@ -106,7 +109,9 @@ def named_files(path: Path) -> NamedFiles:
             robots += inner.robots
             records += inner.records
             systems += inner.systems
-    return NamedFiles(_once(files), _once(robots), _once(records), tuple(dict.fromkeys(systems)), len(containers))
+            hub = hub or inner.hub
+    named = dict.fromkeys(systems)
+    return NamedFiles(_once(files), _once(robots), _once(records), tuple(named), len(containers), hub)
 
 
 def _once(paths: Iterable[Path]) -> tuple[Path, ...]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from msgspec import structs
 from rich.markup import escape
 
 from trade.atomic_files import replace
@@ -130,7 +131,7 @@ def _unit(named: NamedFiles, user: str, root: Path) -> str:
     return unit_text(
         seen(named.files[0]),
         user=user,
-        needs=needs_of(map(load, named.robots)),
+        needs=structs.replace(needs_of(map(load, named.robots)), hub=named.hub),
         containers=named.containers,
         program=[str(seen(Path(sys.executable))), "-m", "trade_gateway"],
         folders=map(seen, (*program_folders(), *(one.parent for one in named.files))),

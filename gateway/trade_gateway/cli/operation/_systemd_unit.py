@@ -8,6 +8,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from trade.transport.precedence import NICE
 from trade_drivers import CanBus, Robot, SerialBus
 from trade_gateway.process._real_time import PRIORITY
 
@@ -29,6 +30,8 @@ class HostResources(Struct, frozen=True):
     """Whether they need CAN interfaces of the kernel."""
     real_time: bool = False
     """Whether drivers run in real time."""
+    hub: bool = False
+    """Whether the gateway is the hub of its host."""
 
 
 def needs_of(robots: Iterable[Robot]) -> HostResources:
@@ -89,6 +92,7 @@ def unit_text(
         *(f"BindPaths={_quoted(str(folder))}" for folder in written if _is_hidden(folder)),
     ]
     open_ = [f"ReadWritePaths={_quoted(str(folder))}" for folder in written if not _is_hidden(folder)]
+    calls = [*(["sched_setscheduler"] if needs.real_time else []), *(["setpriority"] if needs.hub else [])]
     families = ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", *(["AF_CAN"] if needs.can else [])]
     parts = {
         "FILE": _plain(str(gateway)),
@@ -98,8 +102,8 @@ def unit_text(
         "HOME": "\n".join([f"ProtectHome={'tmpfs' if homes else 'yes'}", *homes, *open_]),
         "DEVICES": _devices(needs),
         "FAMILIES": " ".join(families),
-        "REALTIME": _REAL_TIME if needs.real_time else "RestrictRealtime=yes",
-        "CALLS": "\nSystemCallFilter=sched_setscheduler" if needs.real_time else "",
+        "REALTIME": (_REAL_TIME if needs.real_time else "RestrictRealtime=yes") + (_AHEAD if needs.hub else ""),
+        "CALLS": f"\nSystemCallFilter={' '.join(calls)}" if calls else "",
     }
     return re.sub(r"@([A-Z]+)@", lambda found: parts[found.group(1)], _UNIT)
 
@@ -142,6 +146,10 @@ _REAL_TIME: Final = f"""\
 # Drivers run in real time; other processes do not request it.
 LimitRTPRIO={PRIORITY}
 LimitMEMLOCK=infinity"""
+
+_AHEAD: Final = f"""
+# The threads of the hub precede those of the containers that it serves.
+LimitNICE={NICE}"""
 
 _UNIT: Final = """\
 [Unit]
