@@ -4,6 +4,7 @@ import os
 import resource
 import socket
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,7 @@ def test_attached_containers_have_one_link_and_work_together_with_linked_ones(
             if other is not container:
                 assert find(container, "move", f"of.{other.name}")(7) == 7
     assert [links(container).count() for container in attached] == [1, 1, 1]
+    assert [container._parts.transport.relayed for container in everyone] == [False, *[True] * 3, False, False]
     assert [links(container).count() for container in linked] == [2, 2]
     assert links(hub).count() == len(attached) + len(linked)
 
@@ -126,13 +128,26 @@ def test_calls_between_attached_containers_do_not_pass_through_the_hub(
     tapped.undeclare()
 
 
-def test_a_container_that_attaches_knows_all_others_at_once(hub: Container, start_container: StartContainer) -> None:
+def test_a_container_that_attaches_knows_all_others_before_it_hears_of_their_signs_of_life(
+    hub: Container, start_container: StartContainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     names = [f"c{number}" for number in range(8)]
     for name in names:
         start_container(name).register(Joint(), f"of.{name}")
+    presences, begun = ZenohTransport.presences, threading.Event()
+
+    def heard_later(transport: ZenohTransport, pattern: str) -> Any:
+        channel: Any = presences(transport, pattern)
+        receive = channel.receive
+        channel.receive = lambda: begun.wait(20) and receive()
+        return channel
+
+    monkeypatch.setattr(ZenohTransport, "presences", heard_later)
     late = start_container("late")
-    assert {info.name for info in late.containers()} == {"hub", "late", *names}
-    assert len(late.services(where(name="move", kind="Joint"))) == len(names)
+    known, services = {info.name for info in late.containers()}, late.services(where(name="move", kind="Joint"))
+    begun.set()
+    assert known == {"hub", "late", *names}
+    assert len(services) == len(names)
 
 
 @pytest.mark.realtime

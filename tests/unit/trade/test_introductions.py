@@ -135,10 +135,13 @@ def test_what_opens_again_needs_an_answer_whatever_it_announced_before() -> None
 
 
 @pytest.mark.usefixtures("_behind_a_hub")
-def test_what_was_withdrawn_meanwhile_is_not_known(system: MemorySystem) -> None:
-    lamp, late = Lamp(), system.container("late")
+def test_what_was_withdrawn_before_the_introduction_leaves_a_gap_for_which_others_query(system: MemorySystem) -> None:
+    lamp, reader = Lamp(), system.container("reader")
+    queries = Queries(system)
     arm = system.container("arm")
     arm.register(lamp, "lamps.arm")
     arm.deregister(lamp)
+    arm.register(Lamp(), "lamps.other")
     system.settle()
-    assert late.services(where(name="dim")) == []
+    assert queries.to("arm") == ["reader"]
+    assert [handle.key.provider for handle in reader.services(where(name="dim"))] == ["Lamp-2"]

@@ -50,7 +50,6 @@ class _Part(Struct, kw_only=True):
     ros: str = ""
     http: _Http | None = None
     gateway: str = ""
-    hub: bool = False
     host: str = _LOCAL
 
     def files(self, folder: Path) -> Iterator[Path]:
@@ -81,6 +80,7 @@ class _File(_Part, kw_only=True):
     system: str | _System
     share: dict[str, _Share] = {}
     container: dict[str, _Part] = {}
+    hub: bool = False
 
 
 class _Policy(Struct):
