@@ -137,15 +137,19 @@ def _join_at(
     networks: list[list[str]],
     leaving: contextlib.ExitStack,
 ) -> ZenohTransport:
-    connect, certified = list(settings.connect), certificate is not None
+    neighbours, certified = list[str](), certificate is not None
     rendezvous: HostFolder | None = None
-    if networks or not connect:
+    if networks or not settings.connect:
         rendezvous = HostFolder(settings.system)
         leaving.callback(rendezvous.leave)
-        connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
+        neighbours = _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
-    transport = ZenohTransport(_configuration(settings, certificate, listen=listen, connect=connect, bridge=networks))
+    transport = ZenohTransport(
+        _configuration(
+            settings, certificate, listen=listen, connect=settings.connect, neighbours=neighbours, bridge=networks
+        )
+    )
     if rendezvous is not None:
         transport.keep_files = rendezvous.keep
     return transport
@@ -157,6 +161,7 @@ def _configuration(
     *,
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
+    neighbours: Sequence[str] = (),
     bridge: Sequence[Sequence[str]] = (),
     hub: str = "",
 ) -> dict[str, Any]:
@@ -164,6 +169,7 @@ def _configuration(
         namespace=settings.system,
         listen=listen,
         connect=connect,
+        neighbours=neighbours,
         credentials=None if certificate is not None else settings.credentials or user_secret(),
         certificate=certificate,
         bridge=bridge,

@@ -72,22 +72,20 @@ class PortGuard:
         with select.epoll() as arrivals:
             for sock in self._sockets:
                 arrivals.register(sock, select.EPOLLIN | select.EPOLLET)
-            look_until = time.monotonic() + _QUIET_S  # some may have come before this thread began
+            crowded = True  # some may have come before this thread began
             while not self._ending.is_set():
-                came, now = arrivals.poll(_LOOK_S), time.monotonic()
-                look_until = now + _QUIET_S if came or self._shut else look_until
-                if now < look_until or self._flood is not None:
-                    look_until = look_until if self._look(now) else now
+                if arrivals.poll(_LOOK_S) or crowded:  # few strangers become many only by arrivals
+                    crowded = self._look(time.monotonic())
                     self._ending.wait(_AGAIN_S)
         self._filter(frozenset())
 
     def _look(self, now: float) -> bool:
-        """Returns whether connections may be there that are no links, or not yet."""
+        """Returns whether so many strangers may be there, or were not long ago, that they have to be counted again."""
         try:
             there = _connections(self._ports)
         except OSError as bad:
             _logger.debug("the ports of the transport cannot be inspected: %s", bad)
-            return False
+            return self._flood is not None
         strangers, new, self._known = len(there) - self._links(), there - self._known, there
         if self._flood is None and strangers > self._limit // 2:
             self._flood = _Flood(now, ", ".join(map(str, sorted(self._ports))), there)
@@ -100,7 +98,7 @@ class PortGuard:
             self._filter(self._shut | crowded)
         if self._flood is not None and self._flood.log_due(now, strangers, self._limit, shut=bool(self._shut)):
             self._flood = None
-        return strangers > 0
+        return self._flood is not None
 
     def _filter(self, shut: frozenset[int]) -> None:
         """Shuts these sockets, and opens the others: strangers at one network do not keep new links from another."""

@@ -31,7 +31,8 @@ from trade.transport.base import (
     Transport,
 )
 from trade.transport.endpoints import Endpoint
-from trade.transport.zenoh_links import Links, new_session_id, open_session
+from trade.transport.timer_slack import read_patiently
+from trade.transport.zenoh_links import LESS_OFTEN, Links, new_session_id, open_session
 from trade.transport.zenoh_prompt import Prompt
 
 _logger = logging.getLogger("trade")
@@ -59,6 +60,7 @@ def configuration(
     namespace: str,
     listen: Sequence[str],
     connect: Sequence[str],
+    neighbours: Sequence[str] = (),
     credentials: tuple[str, str] | None = None,
     certificate: Certificate | None = None,
     bridge: Sequence[Sequence[str]] = (),
@@ -66,6 +68,9 @@ def configuration(
     rules: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """The settings of one session, in zenoh's names.
+
+    ``neighbours`` are containers of this host, which may have dialled this one already. zenoh 1.10 dials an endpoint
+    without end if its session is linked otherwise, so they are dialled again less often.
 
     ``bridge`` has the interfaces of each network that it joins; an empty list of them stands for all. With ``hub``, its
     endpoint, the only link of the session is that to the hub, which carries everything (`trade.hub_file`).
@@ -82,7 +87,7 @@ def configuration(
         "transport/shared_memory/enabled": not (bridge or hub),
         "namespace": namespace,
         "listen/endpoints": list(listen),
-        "connect/endpoints": [hub] if hub else list(connect),
+        "connect/endpoints": [hub] if hub else [*connect, *map(_less_often, neighbours)],
         # Without a hub -1: 0 would be no retry, and opening waits half a second at most.
         "connect/timeout_ms": _COMING_IN_MS if hub else -1,
         "connect/exit_on_failure": bool(hub),
@@ -113,6 +118,10 @@ def configuration(
     }
 
 
+def _less_often(endpoint: str) -> str:
+    return endpoint if "#" in endpoint else f"{endpoint}{LESS_OFTEN}"
+
+
 def _region(interfaces: Sequence[str]) -> dict[str, Any]:
     """The peers on these interfaces form one network; routers do not belong to it, as they are other bridges."""
     where = {"interfaces": list(interfaces)} if interfaces else {}
@@ -139,7 +148,7 @@ class ZenohChannel(Channel):
     def receive(self) -> Message:
         recv = self._recv
         try:
-            sample: zenoh.Sample = recv()
+            sample: zenoh.Sample = read_patiently(recv)
         except zenoh.ZError:
             if self._go_on(recv):
                 return self.receive()
@@ -233,7 +242,7 @@ class ZenohQuestions(Questions):
 
     def receive(self) -> Question:
         try:
-            return ZenohQuestion(self._recv())
+            return ZenohQuestion(read_patiently(self._recv))
         except zenoh.ZError:
             raise ChannelClosed from None
 

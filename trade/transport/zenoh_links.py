@@ -40,6 +40,8 @@ _TAG: Final = 16
 _NAME: Final = 12
 """Hexadecimal digits. A beacon's id consists of its system's tag, this many digits of the main session's id, and the
 port that the main session listens on, so a scout knows which container it found, and dials its main session."""
+LESS_OFTEN: Final = "#retry_period_max_ms=4000"
+"""What an endpoint ends with that is dialled every four seconds at last, not every second."""
 _LOOK_S: Final = 0.01
 _MOMENT_S: Final = 1.0
 
@@ -128,7 +130,7 @@ class Links:
         """The endpoint of the hub of this host, if the main session is linked to it only; it cannot be dialled then."""
         self.certified: Final = _TLS in settings
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
-        self.connect: Final[tuple[str, ...]] = tuple(settings["connect/endpoints"])
+        self.connect: Final = tuple(endpoint.removesuffix(LESS_OFTEN) for endpoint in settings["connect/endpoints"])
         """The endpoints that the main session dials."""
         self._known_at_start = _dialled()
         """The addresses at the start: all that the main session ever announces by gossip."""

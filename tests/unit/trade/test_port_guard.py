@@ -85,25 +85,29 @@ def test_established_links_do_not_count_as_strangers(door: socket.socket, dial: 
         guard.close()
 
 
-def test_the_connections_are_inspected_again_only_while_some_are_no_links(
+def test_the_connections_are_inspected_again_only_while_there_are_many_strangers(
     door: socket.socket, dial: Callable[[int], bool]
 ) -> None:
-    looks = {"link": 0, "stranger": 0}
+    looks = {"few": 0, "many": 0}
 
     def count(kind: str) -> int:
         looks[kind] += 1
-        return 1 if kind == "link" else 0
+        return 0
 
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        ports = {"link": door.getsockname()[1], "stranger": other.getsockname()[1]}
-        assert all(dial(port) for port in ports.values())
+    with socket.create_server(("127.0.0.1", 0), backlog=MOST_STRANGERS) as other:
+        ports = {"few": door.getsockname()[1], "many": other.getsockname()[1]}
+        assert all(dial(ports["few"]) for _ in range(MOST_STRANGERS // 2))
+        assert all(dial(ports["many"]) for _ in range(MOST_STRANGERS // 2 + 1))
         guards = [PortGuard([port], partial(count, kind)) for kind, port in ports.items()]
         try:
-            wait_until(lambda: looks["stranger"] > 6)
+            wait_until(lambda: looks["many"] > 6)
+            assert looks["few"] <= 2  # at the beginning, and for those who arrived before
+            looks["few"] = 0
+            assert dial(ports["few"])
+            wait_until(lambda: looks["few"] > 0)
         finally:
             for guard in guards:
                 guard.close()
-    assert looks["link"] == 1
 
 
 def test_a_guard_that_is_closed_lets_all_in(door: socket.socket, dial: Callable[[int], bool]) -> None:

@@ -5,12 +5,14 @@ import gc
 import secrets
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from tests.support.waiting import wait_until
 from trade.testing import LossConformance, Severable, TransportConformance
 from trade.testing._ear import meet
 from trade.transport.base import Channel, ChannelClosed, Presence, Questions
@@ -221,3 +223,35 @@ class TestZenohLosses(LossConformance):
             signs = one.appear("linked/0"), other.appear("linked/1")
             _wait_for_links(other, len(signs))
             yield Severable(one, other, cable.unplug, cable.plug)
+
+
+@pytest.mark.realtime
+def test_a_neighbour_that_cannot_be_linked_is_dialled_less_often_than_a_configured_endpoint() -> None:
+    dials: Counter[str] = Counter()
+
+    def refuse(name: str, server: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # it is closed
+            while True:
+                server.accept()[0].close()
+                dials[name] += 1
+
+    with contextlib.ExitStack() as stack:
+        endpoints: list[str] = []
+        for name in ("configured", "neighbour"):
+            server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+            stack.callback(server.shutdown, socket.SHUT_RDWR)
+            threading.Thread(target=refuse, args=(name, server), daemon=True).start()
+            endpoints.append(f"tcp/127.0.0.1:{server.getsockname()[1]}")
+        transport = ZenohTransport(
+            configuration(
+                namespace="lab",
+                listen=[free_endpoint()],
+                connect=endpoints[:1],
+                neighbours=endpoints[1:],
+                credentials=("a", "b"),
+            )
+        )
+        stack.callback(transport.close)
+        assert transport.links.connect == tuple(endpoints)
+        wait_until(lambda: dials["configured"] >= 8)
+        assert 4 <= dials["neighbour"] <= dials["configured"] - 2
