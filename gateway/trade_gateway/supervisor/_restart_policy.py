@@ -13,7 +13,7 @@ SAVE_S: Final = 6.0
 """How long saving its state before its end may take, in seconds."""
 GRACE_S: Final = 20.0
 """How long its shutdown may take, in seconds: a robot is brought to rest first."""
-_FIRST_S: Final = 0.1
+_FIRST_S: Final = 0.05
 _LONGEST_S: Final = 30.0
 _DOUBLINGS: Final = 16
 """The wait before a restart doubles from the first to the longest."""

@@ -103,7 +103,7 @@ def test_the_wait_doubles_and_after_too_many_ends_in_the_window_it_is_given_up()
         assert child.state is State.WAITING
         waits.append(child.wait_s)
         assert child.due(child.deadline) is Transition.LAUNCH
-    assert waits == [0.1, 0.2, 0.4]
+    assert waits == [0.05, 0.1, 0.2]
     child.ended(4.0, "code 1: no such port")
     assert (child.state, child.why, child.deadline) == (State.GIVEN_UP, "code 1: no such port", math.inf)
     assert child.due(1e9) is None
@@ -114,7 +114,7 @@ def test_ends_beyond_the_window_are_forgotten_and_the_wait_is_bounded() -> None:
     child.start(0.0)
     for now in range(100, 1000, 100):
         child.ended(float(now), "signal 9")
-        assert (child.state, child.wait_s) == (State.WAITING, 0.1)
+        assert (child.state, child.wait_s) == (State.WAITING, 0.05)
         child.due(child.deadline)
     patient = life(restarts=1000, window_s=1e9)
     patient.start(0.0)
@@ -212,8 +212,8 @@ def test_a_child_whose_device_is_absent_is_started_again_without_limit() -> None
         child.ended(now, "ended (exit code 75)", absent=True)
         assert child.state is State.WAITING
         waits.append(child.wait_s)
-    assert waits[:3] == [0.1, 0.2, 0.4]
-    assert set(waits[9:]) == {30.0}
+    assert waits[:3] == [0.05, 0.1, 0.2]
+    assert set(waits[10:]) == {30.0}
     launched(child, now)
     child.up(child.deadline)
     assert child.state is State.UP
