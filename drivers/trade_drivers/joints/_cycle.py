@@ -2,8 +2,10 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from enum import Enum
+from typing import Final
 
 from trade.errors import DeviceSilent, MotionStopped, TradeError
 from trade_drivers.bus._angle_store import Span
@@ -12,6 +14,9 @@ from trade_drivers.bus._gate import Command
 from trade_drivers.bus._jobs import AwaitedJob, Device, Gate, Steps
 from trade_drivers.joints._axis import AxisMotion, AxisT, Goal
 from trade_robotfile import Bus
+
+_SAVE_AGAIN_NS: Final = 1_000_000_000
+"""The pause before what could not be saved is saved again."""
 
 
 class ControlMode(Enum):
@@ -30,8 +35,11 @@ class Exchange(BusCycle[AxisT]):
 
     def __init__(self, bus: Bus, devices: Sequence[AxisT], clock: Callable[[], int] | None = None) -> None:
         super().__init__(bus, devices, clock)
-        self.save_angles: Callable[[Mapping[str, Span]], object] | None = None
-        """Saves where joints are, by their names in the robot file, without waiting."""
+        self.save_angles: Callable[[Mapping[str, Span]], Future[bool]] | None = None
+        """Saves where joints are, by their names in the robot file, without waiting; says whether it succeeded."""
+        self._unsaved = False
+        """Whether saving has failed, as on a full disk, since all was saved again."""
+        self._save_again_ns = 0
         for axis in devices:
             axis.zero.period_s = 1 / bus.rate_hz
             axis.zero.unled_s = bus.watchdog_s + bus.stale_after_s
@@ -177,13 +185,22 @@ class Exchange(BusCycle[AxisT]):
         for axis in self.devices:
             axis.tell_moving()
         self.answer_stops(now_ns)
-        self._save_angles()
+        self._save_angles(now_ns)
 
-    def _save_angles(self) -> None:
+    def _save_angles(self, now_ns: int) -> None:
         if self.save_angles is not None:
+            if self._unsaved and now_ns >= self._save_again_ns:
+                self._unsaved, self._save_again_ns = False, now_ns + _SAVE_AGAIN_NS
+                for axis in self.devices:
+                    axis.zero.unsaved()
             changed = {axis.joint.name: span for axis in self.devices if (span := axis.zero.to_save()) is not None}
             if changed:
-                self.save_angles(changed)
+                self.save_angles(changed).add_done_callback(self._saved)
+
+    def _saved(self, saving: Future[bool]) -> None:
+        """Called on the thread of the disk."""
+        if not saving.result():
+            self._unsaved = True
 
     def _watch_halt(self, axis: AxisT, now_ns: int, again: list[AxisT]) -> None:
         """Repeats the hold of a joint that still moves, unless it has a fault; a fault does not prove that it stopped.

@@ -17,6 +17,7 @@ _SAME_RAD: Final = 0.005
 """The precision of a saved angle."""
 _AHEAD_S: Final = 0.25
 """How long a moving joint stays within what was saved."""
+_NOWHERE: Final[Span] = (inf, -inf)
 _LAST: Final = "was last known at"
 _ALIAS: Final = "by its place in a turn of its motor, it may as well be in its range at"
 
@@ -44,7 +45,7 @@ class Zero:
         """The newest measurement in which the zero was not in doubt."""
         self._known: Span | None = None
         """Where the joint may have been at the next measurement."""
-        self._saved: Span = (inf, -inf)
+        self._saved: Span = _NOWHERE
         self._unwatched = True
         self.searching = False
         """True while a homing moves the joint to find its zero."""
@@ -120,6 +121,11 @@ class Zero:
                 return None
             self._saved = (low - margin_rad, high + margin_rad)
             return self._saved
+
+    def unsaved(self) -> None:
+        """What was to be saved may be lost: `to_save` returns it again."""
+        with self._lock:
+            self._saved = _NOWHERE
 
     def _contradiction(self, angle_rad: float, elapsed_s: float) -> tuple[str, float] | None:
         """Returns the other angle if this one contradicts what is known."""

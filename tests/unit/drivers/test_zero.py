@@ -239,6 +239,18 @@ def test_S23_a_device_that_keeps_its_zero_is_not_compared(bench: Bench) -> None:
     assert not saved(bench)
 
 
+def test_S23_an_angle_that_could_not_be_saved_is_saved_once_the_disk_accepts_it_again(damiao: Bench) -> None:
+    blocked = damiao.folder / "angles"
+    blocked.touch()  # where the folder has to be
+    with closing(damiao.attach()) as robot:
+        motor = robot.motor("tail.root")
+        motor.enable()
+        motor.move_to(3.0)
+        wait_until(lambda: not motor.state().moving)
+        blocked.unlink()
+        wait_until(lambda: blocked.is_dir() and saved(damiao), "it is saved, although the joint does not move")
+
+
 def saved(bench: Bench) -> list[str]:
     store = AngleStore(bench.folder / "angles" / "rosie.sqlite", print)
     try:
