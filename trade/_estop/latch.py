@@ -23,6 +23,8 @@ from trade.protocol.messages import Estop, EstopOrder
 _logger = logging.getLogger("trade")
 
 _LOOK_AGAIN_S: Final = 0.005
+_WRITE_AGAIN_S: Final = 1.0
+"""The pause before what could not be written is written again."""
 
 Confirm = Callable[[str, str], None]
 """Confirms a request, with the problem if a part failed; does not wait."""
@@ -63,6 +65,10 @@ class EstopLatch:
         self._round: Round | None = None
         """The last round of stops, if an e-stop was open here ever since it began."""
         self._finished = 0.0
+        self._unwritten = set[str]()
+        """The e-stops that could not be written to disk."""
+        self._write_again_at = 0.0
+        self._closed = False
         self._worker = Worker(self._work, "trade-estop-work")
         self._relays: list[Relay] = []
         self._latch()
@@ -134,6 +140,7 @@ class EstopLatch:
         for estop in self.open():
             if problem := self._written(estop):
                 _logger.error("e-stop %s %s", estop.id, problem)
+                self._worker.wake()
 
     # --- stopping
 
@@ -165,8 +172,26 @@ class EstopLatch:
             if not self.is_open(estop.id):
                 self._store.remove(estop.id)
         except OSError as bad:
+            self._unwritten.add(estop.id)
             return f"is not written down and will not outlive this process: {bad}"
+        self._unwritten.discard(estop.id)
         return ""
+
+    def _write_again(self) -> float | None:
+        """Writes what could not be written, once a second; returns when to call this again, in seconds."""
+        if self._closed or not self._unwritten:
+            return None
+        if (early_s := self._write_again_at - time.monotonic()) > 0:
+            return early_s
+        for estop in self.open():
+            if estop.id not in self._unwritten:
+                continue
+            if self._written(estop):
+                self._write_again_at = time.monotonic() + _WRITE_AGAIN_S
+                return _WRITE_AGAIN_S
+            _logger.warning("e-stop %s is written down now", estop.id)
+        self._unwritten.clear()  # those that are left are cleared
+        return None
 
     # --- clearing
 
@@ -212,7 +237,8 @@ class EstopLatch:
         finished = [(one, result) for one in pending if (result := one.result()) is not None]
         if finished:
             self._finish(finished)
-        return _LOOK_AGAIN_S if self._pending else None
+        again_s = self._write_again()
+        return _LOOK_AGAIN_S if self._pending else again_s
 
     def _persist(self, pending_request: Pending) -> None:
         if pending_request.noted:
@@ -237,6 +263,9 @@ class EstopLatch:
 
     def close(self) -> None:
         """Waits for work under way. Idempotent."""
+        self._closed = True
+        if self._unwritten:
+            self._worker.wake()
         self._worker.close()
         for relay in self._relays:
             relay.close()

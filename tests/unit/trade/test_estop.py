@@ -12,6 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from tests.support.waiting import wait_until
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._audit.events import Event
 from trade._estop.ledger import MOST_OF_ONE
@@ -318,6 +319,24 @@ def test_S09_a_container_that_cannot_write_the_estop_to_disk_stops_and_says_so(t
         report = system.container("one").estop(limit_s=GENEROUS_S)
         assert "not written down" in report.failed["tester/one"]
         assert axis.stopped == 1
+
+
+def test_S09_an_estop_that_could_not_be_written_is_written_once_the_disk_accepts_it(tmp_path: Path) -> None:
+    blocked = tmp_path / "memory"
+    blocked.write_text("a file where a folder should be")
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one")
+        one = system.container("one")
+        cleared, kept = (one.estop(reason, limit_s=GENEROUS_S) for reason in ("dust", "spill"))
+        assert "not written down" in kept.failed["tester/one"]
+        one.estop_clear([cleared.id], limit_s=GENEROUS_S)
+        blocked.unlink()
+        wait_until(lambda: [*tmp_path.rglob("*.json")])
+        assert [note.stem for note in tmp_path.rglob("*.json")] == [kept.id]
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one")
+        with pytest.raises(Stopped, match="spill"):
+            call(system.container("one"), "move_to", "one", 0.1)
 
 
 def test_S09_a_container_with_nothing_to_stop_writes_nothing(tmp_path: Path) -> None:
