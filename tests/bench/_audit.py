@@ -79,9 +79,9 @@ def _measure_calls(folder: str, n: int, rounds: int) -> dict[str, list[tuple[flo
         lamps = {name: container.find(where(name="dim", group=name), wait_s=30) for name in results}
         for i in range(rounds):
             took_us: dict[str, list[float]] = {_OFF: [], _ON: []}
-            for _ in range(max(1, n // _IN_TURN)):
+            for done in range(0, n, _IN_TURN):
                 for name, took in took_us.items():
-                    for _ in range(min(n, _IN_TURN)):
+                    for _ in range(min(_IN_TURN, n - done)):
                         began = time.perf_counter_ns()
                         lamps[name](0.5)
                         took.append((time.perf_counter_ns() - began) / 1e3)

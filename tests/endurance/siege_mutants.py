@@ -8,6 +8,7 @@ import re
 
 import pytest
 
+from tests.support.mutants import PATHS
 from tests.system.siege_minimised import besiege
 
 SHOWS_IN = {
@@ -20,7 +21,6 @@ SHOWS_IN = {
 """By mutant, the troubles in which it shows. The other mutants need a moment that a siege may not meet."""
 _MINUTES = 0.9
 _SEEDS = (1, 2, 3, 4, 5)
-PATHS = {"local path": "1", "transport": "0"}
 
 
 @pytest.mark.mutant

@@ -12,6 +12,8 @@ from tests.support import waiting
 
 Patch = Callable[[Any, str, Any], object]
 """As `setattr`."""
+PATHS: Final = {"local path": "1", "transport": "0"}
+"""The ways that calls on one host can take, and what ``TRADE_LOCAL_PATH`` is for each."""
 _IMPATIENCE_S: Final = 6.0
 """How long a test waits for what a mutant never does."""
 

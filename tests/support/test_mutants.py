@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 from tests.endurance.chaos._mutants import MUTANTS
-from tests.support.mutants import HOW
+from tests.support.mutants import HOW, PATHS
 
 ROOT = Path(__file__).parents[2]
 EVERYWHERE = ROOT / "tests" / "support" / "everywhere"
 PAGE = ROOT / "docs" / "testing.md"
 _ROW = re.compile(r"^\| `([\w-]+)` \| (.*) \| `([\w/.]+)::(\w+)` \|$", re.MULTILINE)
 ROWS = [(mutant, file, test) for mutant, _, file, test in _ROW.findall(PAGE.read_text())]
-PATHS = {"local path": "1", "transport": "0"}
 ON_EITHER_PATH = {"anybody-may", "nothing-stops", "stop-loses"}
 """The mutants of locks and motion whose tests make calls between containers that may take the local path.
 

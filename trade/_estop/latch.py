@@ -183,14 +183,16 @@ class EstopLatch:
             return None
         if (early_s := self._write_again_at - time.monotonic()) > 0:
             return early_s
-        for estop in self.open():
-            if estop.id not in self._unwritten:
-                continue
-            if self._written(estop):
+        unwritten = [*self._unwritten]
+        opened = {estop.id: estop for estop in self.open()}
+        for estop_id in unwritten:
+            if estop_id not in opened:  # it was cleared
+                self._unwritten.discard(estop_id)
+            elif self._written(opened[estop_id]):
                 self._write_again_at = time.monotonic() + _WRITE_AGAIN_S
                 return _WRITE_AGAIN_S
-            _logger.warning("e-stop %s is written down now", estop.id)
-        self._unwritten.clear()  # those that are left are cleared
+            else:
+                _logger.warning("e-stop %s is written down now", estop_id)
         return None
 
     # --- clearing
