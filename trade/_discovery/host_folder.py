@@ -1,7 +1,7 @@
 """Discovery on one host: a folder with a file for the loopback endpoint of each container of a system.
 
-The loopback interface carries no multicast. A container that starts writes its own endpoint first and then reads the
-others', so of two that start together at least one sees the other; the newcomer dials all others.
+The loopback interface carries no multicast. Containers enter one after the other: each writes its own endpoint, reads
+those of the earlier ones, and dials them. No two dial each other.
 """
 
 import contextlib
@@ -10,6 +10,7 @@ import logging
 import os
 import socket
 import time
+from collections.abc import Generator
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -31,6 +32,9 @@ _YOUNG_S: Final = 10.0
 _LOCKED: Final = "locked"
 """The last line of a file that its process keeps locked (``flock``): without the lock, the process is gone."""
 _CONNECT_S: Final = 0.5
+_TURN_S: Final = 1.0
+"""A container that enters takes milliseconds. Without a turn by then, as if one is frozen, the next enters as well."""
+_LOOK_S: Final = 0.001
 
 
 class HostFolder:
@@ -43,6 +47,8 @@ class HostFolder:
         self._own: Path | None = None
         self._file: FileIO | None = None
         """The file, open and locked for as long as this process lives."""
+        self.entered_ns = 0
+        """When this container entered, by the monotonic clock: after all others whose endpoints it read."""
         self._warned = False
 
     def _folder(self) -> Path:
@@ -56,8 +62,20 @@ class HostFolder:
         A container that cannot write, as on a full disk, still dials the others: it may be there to stop them.
         """
         self._endpoint = endpoint
-        self._publish()
-        return self._others()
+        with self._turn():
+            self.entered_ns = time.monotonic_ns()
+            self._publish()
+            return self._others()
+
+    @contextlib.contextmanager
+    def _turn(self) -> Generator[None, None, None]:
+        """Enter while no other container does; without a file system with locks, at once."""
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError, ConfigurationError):
+                folder = os.open(self._folder(), os.O_RDONLY)
+                stack.callback(os.close, folder)
+                _wait_locked(folder)
+            yield
 
     def keep(self) -> None:
         """Publish our endpoint again if its file has vanished, as when the folder was emptied. Called now and then."""
@@ -118,6 +136,20 @@ class HostFolder:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+def _wait_locked(file: int) -> None:
+    """Lock an open file, unless another process keeps it locked for a second. Raises OSError."""
+    until = time.monotonic() + _TURN_S
+    while fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(_LOOK_S)
+        else:
+            return
 
 
 def _written(path: Path, text: str) -> FileIO:

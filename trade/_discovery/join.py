@@ -41,7 +41,8 @@ def join(settings: Settings, certificate: Certificate | None, leaving: contextli
         transport.close()
         raise
     most = MOST_STRANGERS if certificate is None else MOST_WITH_TLS
-    guard = PortGuard((own.port for own in transport.links.listen), transport.links.count, most)
+    links = transport.links
+    guard = PortGuard((own.port for own in links.listen), links.count, links.far_ends, most)
     leaving.callback(guard.close)
     return transport
 
@@ -137,18 +138,17 @@ def _join_at(
     networks: list[list[str]],
     leaving: contextlib.ExitStack,
 ) -> ZenohTransport:
-    neighbours, certified = list[str](), certificate is not None
+    connect, certified = list(settings.connect), certificate is not None
     rendezvous: HostFolder | None = None
     if networks or not settings.connect:
         rendezvous = HostFolder(settings.system)
         leaving.callback(rendezvous.leave)
-        neighbours = _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
+        connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
+    began_ns = None if rendezvous is None else rendezvous.entered_ns
     transport = ZenohTransport(
-        _configuration(
-            settings, certificate, listen=listen, connect=settings.connect, neighbours=neighbours, bridge=networks
-        )
+        _configuration(settings, certificate, listen=listen, connect=connect, began_ns=began_ns, bridge=networks)
     )
     if rendezvous is not None:
         transport.keep_files = rendezvous.keep
@@ -161,7 +161,7 @@ def _configuration(
     *,
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
-    neighbours: Sequence[str] = (),
+    began_ns: int | None = None,
     bridge: Sequence[Sequence[str]] = (),
     hub: str = "",
 ) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def _configuration(
         namespace=settings.system,
         listen=listen,
         connect=connect,
-        neighbours=neighbours,
+        began_ns=began_ns,
         credentials=None if certificate is not None else settings.credentials or user_secret(),
         certificate=certificate,
         bridge=bridge,

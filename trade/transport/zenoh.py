@@ -32,7 +32,7 @@ from trade.transport.base import (
 )
 from trade.transport.endpoints import Endpoint
 from trade.transport.timer_slack import read_patiently
-from trade.transport.zenoh_links import LESS_OFTEN, Links, new_session_id, open_session
+from trade.transport.zenoh_links import Links, new_session_id, open_session
 from trade.transport.zenoh_prompt import Prompt
 
 _logger = logging.getLogger("trade")
@@ -60,7 +60,7 @@ def configuration(
     namespace: str,
     listen: Sequence[str],
     connect: Sequence[str],
-    neighbours: Sequence[str] = (),
+    began_ns: int | None = None,
     credentials: tuple[str, str] | None = None,
     certificate: Certificate | None = None,
     bridge: Sequence[Sequence[str]] = (),
@@ -69,8 +69,7 @@ def configuration(
 ) -> dict[str, Any]:
     """The settings of one session, in zenoh's names.
 
-    ``neighbours`` are containers of this host, which may have dialled this one already. zenoh 1.10 dials an endpoint
-    without end if its session is linked otherwise, so they are dialled again less often.
+    ``began_ns`` is when its container entered its host: of two, the later one dials the earlier one, never the reverse.
 
     ``bridge`` has the interfaces of each network that it joins; an empty list of them stands for all. With ``hub``, its
     endpoint, the only link of the session is that to the hub, which carries everything (`trade.hub_file`).
@@ -80,14 +79,14 @@ def configuration(
     if credentials is not None:
         entry["transport/auth/usrpwd/user"], entry["transport/auth/usrpwd/password"] = credentials
     return {
-        "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
+        "id": new_session_id(began_ns, dials=all(Endpoint.read(own).loopback for own in listen)),
         "mode": "client" if hub else "router" if bridge else "peer",
         "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
         # A bridge's neighbours are on other hosts; sharing with those on its own host would take 16 MiB for each.
         "transport/shared_memory/enabled": not (bridge or hub),
         "namespace": namespace,
         "listen/endpoints": list(listen),
-        "connect/endpoints": [hub] if hub else [*connect, *map(_less_often, neighbours)],
+        "connect/endpoints": [hub] if hub else list(connect),
         # Without a hub -1: 0 would be no retry, and opening waits half a second at most.
         "connect/timeout_ms": _COMING_IN_MS if hub else -1,
         "connect/exit_on_failure": bool(hub),
@@ -116,10 +115,6 @@ def configuration(
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
     }
-
-
-def _less_often(endpoint: str) -> str:
-    return endpoint if "#" in endpoint else f"{endpoint}{LESS_OFTEN}"
 
 
 def _region(interfaces: Sequence[str]) -> dict[str, Any]:

@@ -36,12 +36,14 @@ WITHOUT_HUB: Final = (
 )
 _NO_PEERS: Final[dict[str, Any]] = {"router": [], "peer": []}
 _DIGITS: Final = 32
+_ORDER: Final = 6
+"""The bytes at the end of an id by which two are compared: a bit, and so many of the time in ticks of a microsecond."""
+_TICKS: Final = 8 * _ORDER - 1
+_TICK_NS: Final = 1_000
 _TAG: Final = 16
 _NAME: Final = 12
 """Hexadecimal digits. A beacon's id consists of its system's tag, this many digits of the main session's id, and the
 port that the main session listens on, so a scout knows which container it found, and dials its main session."""
-LESS_OFTEN: Final = "#retry_period_max_ms=4000"
-"""What an endpoint ends with that is dialled every four seconds at last, not every second."""
 _LOOK_S: Final = 0.01
 _MOMENT_S: Final = 1.0
 
@@ -50,14 +52,22 @@ _TLS: Final = "transport/link/tls"
 _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
 
 
-def new_session_id(*, dials: bool = False) -> str:
+def new_session_id(began_ns: int | None = None, *, dials: bool = False) -> str:
     """An id that zenoh keeps as it is written: its first digit is not zero.
 
     Of two sessions that discover each other the one with the greater id dials; zenoh compares the last byte first. A
     session that listens on this host only can dial others but cannot be dialled from elsewhere: its id is the greater.
+    Of two on one host, that is the one that began later, which dials the earlier one anyway (see `HostFolder`). If each
+    dials the other, both links end, and zenoh 1.10 may take the next one for ended, too, although it stays open.
+
+    Args:
+        began_ns: when the session's container began, in nanoseconds of the host's monotonic clock; None: now.
+        dials: whether it cannot be dialled from elsewhere.
     """
-    digits = secrets.token_hex(_DIGITS // 2)
-    return f"{secrets.choice('123456789abcdef')}{digits[1:-2]}{secrets.randbelow(128) + 128 * dials:02x}"
+    began = (time.monotonic_ns() if began_ns is None else began_ns) // _TICK_NS % 2**_TICKS
+    order = (began + (dials << _TICKS)).to_bytes(_ORDER, "little")
+    digits = secrets.token_hex(_DIGITS // 2 - _ORDER)
+    return f"{secrets.choice('123456789abcdef')}{digits[1:]}{order.hex()}"
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
@@ -130,7 +140,7 @@ class Links:
         """The endpoint of the hub of this host, if the main session is linked to it only; it cannot be dialled then."""
         self.certified: Final = _TLS in settings
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
-        self.connect: Final = tuple(endpoint.removesuffix(LESS_OFTEN) for endpoint in settings["connect/endpoints"])
+        self.connect: Final = tuple(settings["connect/endpoints"])
         """The endpoints that the main session dials."""
         self._known_at_start = _dialled()
         """The addresses at the start: all that the main session ever announces by gossip."""
@@ -165,6 +175,13 @@ class Links:
             return len(list(self._session.info.transports()))
         except zenoh.ZError:  # closed
             return 0
+
+    def far_ends(self) -> set[str] | None:
+        """The endpoints of the far ends of the main session's links, with that of its beacon; None if it is closed."""
+        try:
+            return {_plain(str(link.dst)) for link in self._session.info.links()}
+        except zenoh.ZError:
+            return None
 
     def current(self) -> list[Link] | None:
         """The links of the main session, without those of its own beacon; None if it is closed."""

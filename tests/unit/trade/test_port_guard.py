@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,11 @@ pytestmark = [
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only"),
 ]
+
+
+def none() -> set[str]:
+    """No link."""
+    return set()
 
 
 @pytest.fixture
@@ -57,7 +63,7 @@ def test_connections_beyond_the_limit_are_dropped_until_others_have_gone(
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:
     port, links = door.getsockname()[1], [0]
-    guard = PortGuard([port], lambda: links[0])
+    guard = PortGuard([port], lambda: links[0], none)
     try:
         # Both ends of a connection on this host are connections, and one of them is at the port.
         assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
@@ -76,7 +82,7 @@ def test_established_links_do_not_count_as_strangers(door: socket.socket, dial: 
         looked[0] += 1
         return MOST_STRANGERS + 2
 
-    guard = PortGuard([port], links)
+    guard = PortGuard([port], links, none)
     try:
         assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
         wait_until(lambda: looked[0] > 0)
@@ -98,7 +104,7 @@ def test_the_connections_are_inspected_again_only_while_there_are_many_strangers
         ports = {"few": door.getsockname()[1], "many": other.getsockname()[1]}
         assert all(dial(ports["few"]) for _ in range(MOST_STRANGERS // 2))
         assert all(dial(ports["many"]) for _ in range(MOST_STRANGERS // 2 + 1))
-        guards = [PortGuard([port], partial(count, kind)) for kind, port in ports.items()]
+        guards = [PortGuard([port], partial(count, kind), none) for kind, port in ports.items()]
         try:
             wait_until(lambda: looks["many"] > 6)
             assert looks["few"] <= 2  # at the beginning, and for those who arrived before
@@ -112,11 +118,54 @@ def test_the_connections_are_inspected_again_only_while_there_are_many_strangers
 
 def test_a_guard_that_is_closed_lets_all_in(door: socket.socket, dial: Callable[[int], bool]) -> None:
     port = door.getsockname()[1]
-    guard = PortGuard([port], lambda: 0)
+    guard = PortGuard([port], lambda: 0, none)
     assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
     wait_until(lambda: not dial(port))
     guard.close()
     assert dial(port)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "::1", "::ffff:127.0.0.1"])
+def test_a_connection_that_stays_without_being_a_link_is_ended(address: str, caplog: pytest.LogCaptureFixture) -> None:
+    """As one of which the transport has lost count. The far end of a link, and this process's own end, stay open."""
+    mapped = address.startswith("::f")
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.create_server(("::" if mapped else address, 0), family=family, dualstack_ipv6=mapped) as server:
+        port = server.getsockname()[1]
+        with ExitStack() as stack:
+
+            def connect() -> tuple[socket.socket, socket.socket]:
+                """The far end, and the end here."""
+                there = stack.enter_context(socket.create_connection((address.removeprefix("::ffff:"), port)))
+                return there, stack.enter_context(server.accept()[0])
+
+            (link, linked_here), (stray, stray_here) = connect(), connect()
+            host, far_port = link.getsockname()[:2]
+            guard = PortGuard([port], lambda: 1, lambda: {f"tcp/{f'[{host}]' if ':' in host else host}:{far_port}"})
+            stack.callback(guard.close)
+            stray.settimeout(30)
+            assert stray.recv(1) == b""
+            assert stray_here.recv(1) == b""
+            wait_until(lambda: f"1 connections at port {port} were no links" in caplog.text)
+            linked_here.sendall(b"x")
+            assert link.recv(1) == b"x"
+
+
+def test_connections_are_not_ended_while_the_links_are_unknown(door: socket.socket) -> None:
+    looks = [0]
+
+    def unknown() -> None:
+        looks[0] += 1
+
+    port = door.getsockname()[1]
+    with socket.create_connection(("127.0.0.1", port)) as there, door.accept()[0] as here:
+        guard = PortGuard([port], lambda: 1, unknown)
+        try:
+            wait_until(lambda: looks[0] >= 3, "three looks, each six seconds after the one before")
+            here.sendall(b"x")
+            assert there.recv(1) == b"x"
+        finally:
+            guard.close()
 
 
 def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
@@ -145,7 +194,7 @@ def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
 def test_another_network_of_the_port_stays_open(door: socket.socket, dial: Callable[[int], bool]) -> None:
     port = door.getsockname()[1]
     with socket.create_server(("127.0.0.2", port), backlog=64):
-        guard = PortGuard([port], lambda: 0)
+        guard = PortGuard([port], lambda: 0, none)
         try:
             assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
             wait_until(lambda: not dial(port), "the crowded one is shut")
@@ -161,7 +210,7 @@ def test_connections_from_before_the_guard_count(
     port = door.getsockname()[1]
     assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
     accepted = [door.accept()[0] for _ in range(MOST_STRANGERS + 2)]  # so that none of them is an event
-    guard = PortGuard([port], lambda: 0)
+    guard = PortGuard([port], lambda: 0, none)
     try:
         wait_until(lambda: f"at port {port} are not links" in caplog.text, "it is logged, with no further one")
         assert not dial(port)
@@ -175,7 +224,7 @@ def test_connections_that_their_clients_have_ended_count_and_the_log_names_rate_
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:
     port = door.getsockname()[1]
-    guard = PortGuard([port], lambda: 0, MOST_WITH_TLS)
+    guard = PortGuard([port], lambda: 0, none, MOST_WITH_TLS)
     try:
         there: list[socket.socket] = []
         for _ in range(MOST_WITH_TLS + 2):

@@ -1,9 +1,11 @@
 """How containers of one host find each other: a folder with a file for each one's endpoint."""
 
+import fcntl
 import os
 import re
 import shutil
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -208,6 +210,49 @@ def test_containers_that_start_at_the_same_moment_see_each_other(start_program: 
         for program in pair:
             program.tell()
     assert [program.ends() for program in pair] == [0, 0]
+
+
+@pytest.mark.real_clock
+def test_of_those_that_enter_at_the_same_moment_the_later_ones_see_the_earlier_ones_only(system: str) -> None:
+    """So no two dial each other: each would refuse the other's link."""
+    many = 12
+    folders, together, seen = [HostFolder(system) for _ in range(many)], threading.Barrier(many), [0] * many
+
+    def enter(place: int) -> None:
+        together.wait()
+        seen[place] = len(folders[place].enter(f"tcp/127.0.0.1:{place + 1}"))
+
+    threads = [threading.Thread(target=enter, args=(place,)) for place in range(many)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    by_time = sorted(range(many), key=lambda place: folders[place].entered_ns)
+    assert [seen[place] for place in by_time] == list(range(many))
+    for folder in folders:
+        folder.leave()
+
+
+@pytest.mark.real_clock
+def test_a_container_enters_though_another_one_is_frozen_while_it_does(system: str, folder: Path) -> None:
+    frozen = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(frozen, fcntl.LOCK_EX)
+        rendezvous = HostFolder(system)
+        assert rendezvous.enter("tcp/127.0.0.1:7450") == []
+        assert [path.name for path in folder.iterdir()] == ["tcp_127.0.0.1_7450"]
+        rendezvous.leave()
+    finally:
+        os.close(frozen)
+
+
+@pytest.mark.real_clock
+def test_the_session_of_a_container_has_the_moment_at_which_it_entered(folder: Path) -> None:
+    with Container() as here:
+        [path] = folder.glob("tcp_*")
+        written_us = float(path.read_text().split("\n")[2]) * 1e6
+        began_us = int.from_bytes(bytes.fromhex(str(here._parts.transport._session.zid()))[-6:], "little") - (1 << 47)
+    assert written_us - 60e6 < began_us <= written_us
 
 
 def test_a_known_container_that_does_not_listen_yet_is_dialled_until_it_does(

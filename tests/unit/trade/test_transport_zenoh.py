@@ -5,14 +5,12 @@ import gc
 import secrets
 import socket
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from tests.support.waiting import wait_until
 from trade.testing import LossConformance, Severable, TransportConformance
 from trade.testing._ear import meet
 from trade.transport.base import Channel, ChannelClosed, Presence, Questions
@@ -225,33 +223,25 @@ class TestZenohLosses(LossConformance):
             yield Severable(one, other, cable.unplug, cable.plug)
 
 
-@pytest.mark.realtime
-def test_a_neighbour_that_cannot_be_linked_is_dialled_less_often_than_a_configured_endpoint() -> None:
-    dials: Counter[str] = Counter()
+def test_of_two_sessions_of_a_host_the_one_that_began_later_has_the_greater_id() -> None:
+    """zenoh compares the last byte first; the greater one dials."""
+    ids = [configuration(namespace="lab", listen=[], connect=[])["id"] for _ in range(3)]
+    ids += [
+        configuration(namespace="lab", listen=listen, connect=[], began_ns=began_ns)["id"]
+        for listen in (["tcp/127.0.0.1:1"], ["tcp/0.0.0.0:1"])
+        for began_ns in (0, 70_000, 1_000_000_000, 10**17)
+    ]
+    here_only, anywhere = ids[3:7], ids[7:]
+    order = [*anywhere[:3], *here_only[:3]]
+    assert sorted(order, key=lambda one: bytes.fromhex(one)[::-1]) == order
+    assert [int(one[-2:], 16) < 0x80 for one in ids] == [False] * 7 + [True] * 4
+    assert len({one[:20] for one in ids}) == len(ids)
 
-    def refuse(name: str, server: socket.socket) -> None:
-        with contextlib.suppress(OSError):  # it is closed
-            while True:
-                server.accept()[0].close()
-                dials[name] += 1
 
-    with contextlib.ExitStack() as stack:
-        endpoints: list[str] = []
-        for name in ("configured", "neighbour"):
-            server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-            stack.callback(server.shutdown, socket.SHUT_RDWR)
-            threading.Thread(target=refuse, args=(name, server), daemon=True).start()
-            endpoints.append(f"tcp/127.0.0.1:{server.getsockname()[1]}")
-        transport = ZenohTransport(
-            configuration(
-                namespace="lab",
-                listen=[free_endpoint()],
-                connect=endpoints[:1],
-                neighbours=endpoints[1:],
-                credentials=("a", "b"),
-            )
-        )
-        stack.callback(transport.close)
-        assert transport.links.connect == tuple(endpoints)
-        wait_until(lambda: dials["configured"] >= 8)
-        assert 4 <= dials["neighbour"] <= dials["configured"] - 2
+def test_a_session_keeps_the_id_of_its_settings() -> None:
+    settings = configuration(namespace="lab", listen=[free_endpoint()], connect=[], credentials=("a", "b"), began_ns=0)
+    transport = ZenohTransport(settings)
+    try:
+        assert str(transport._session.zid()) == settings["id"]
+    finally:
+        transport.close()
