@@ -16,7 +16,7 @@ from trade._calls.run import Run
 from trade._locks.lock import Lock, in_own_thread
 from trade._resources.grants import LockRequest
 from trade._threads.scheduler import Scheduler
-from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
+from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, SessionEnded, TradeError
 from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade.protocol.messages import Token
 
@@ -26,6 +26,11 @@ _AGAIN_S: Final = 0.1
 _BEATS: Final = 4
 """Renewals within one lease."""
 _END_S: Final = 2.0
+_GONE: Final = (ServiceGone, ContainerLost, SessionEnded)
+"""Errors of a renewal that say that its grants have ended."""
+_FRESH_S: Final = 1.0
+"""So long after a client was surely alive, no container has ended its session yet: the link to a frozen client is lost
+after two seconds without a sign of life, which are half a second apart."""
 
 
 class LeaseClient:
@@ -56,7 +61,8 @@ class LeaseClient:
             LockedByOther, NotStopped, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
             LockLost: one part was lost while it waited for the others; nothing is held.
         """
-        until = self.clock.now() + terms.wait_s
+        began = self.clock.now()
+        until = began + terms.wait_s
         self._keep(lock)
         try:
             try:
@@ -66,6 +72,7 @@ class LeaseClient:
                 if self.clock.now() >= until:
                     raise
                 self._wait_in_order(lock, wanted, terms, until)
+            self._confirm(lock, began)
             lock.check()
         except BaseException:
             lock.release()
@@ -97,6 +104,26 @@ class LeaseClient:
                     if self.clock.now() + _AGAIN_S >= until:
                         raise
                     time.sleep(_AGAIN_S)
+
+    def _confirm(self, lock: Lock, asked_at: float) -> None:
+        """Renews what was requested too long ago: this process may have been frozen since, and another one granted it.
+
+        A grant that ended with the session of a frozen client still looks new, by the answer that waited for it.
+        """
+        while self.clock.now() - asked_at >= _FRESH_S and lock.wanted:
+            asked_at = self.clock.now()
+            held = {address: token.number for address, token in lock.granted.items()}
+            asks = [
+                (address, self._service(address, "renew").with_(deadline_s=_ANSWER_S).bind([number]))
+                for address, number in held.items()
+            ]
+            for address, result in _at_once(asks):
+                try:
+                    self._take_renewal(address, [(lock, held[address])], result(), asked_at)
+                except TradeError as error:
+                    self._not_renewed(address, [(lock, held[address])], error)
+                    lock.check()
+                    raise
 
     def _ask(self, address: Address, names: Sequence[str], terms: LockRequest) -> BoundCall:
         ask = self._service(address, "acquire").with_(deadline_s=terms.wait_s + _ANSWER_S)
@@ -170,6 +197,11 @@ class LeaseClient:
             return
         finally:
             self.clock.arrived(run)
+        self._take_renewal(address, held, over, asked_at)
+
+    def _take_renewal(
+        self, address: Address, held: list[tuple[Lock, int]], over: dict[int, str], asked_at: float
+    ) -> None:
         for lock, number in held:
             if number not in over:
                 lock.confirm(address, number, asked_at)
@@ -177,7 +209,7 @@ class LeaseClient:
                 lock.lose(over[number])
 
     def _not_renewed(self, address: Address, held: list[tuple[Lock, int]], error: Exception) -> None:
-        if not isinstance(error, (ServiceGone, ContainerLost)):  # too late or refused: its lease decides
+        if not isinstance(error, _GONE):  # too late or refused: its lease decides
             return
         for lock, number in held:
             if lock.has(address, number):

@@ -2,12 +2,14 @@
 
 import threading
 import traceback
+from collections.abc import Callable, Sequence
 
 import pytest
 
 from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
 from trade import Handle, errors, where
+from trade._resources.grants import Granted, LockRequest
 from trade._resources.resource import Latch
 from trade.protocol.keys import Address
 
@@ -20,6 +22,65 @@ class Losses:
 
     def __call__(self, lost: errors.LockLost) -> None:
         self.reported.append(lost)
+
+
+class Frozen:
+    """The client is frozen right before it reads the answer to its request for one joint."""
+
+    def __init__(self, robot: Robot, monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
+        keeper, self._meanwhile, self.renewed = robot.me.lock_api.lease_client, meanwhile, 0
+        ask, service_of = keeper._ask, keeper._service
+
+        def then_frozen(address: Address, names: Sequence[str], terms: LockRequest) -> Callable[[], Granted]:
+            bound = ask(address, names, terms)
+
+            def answered() -> Granted:
+                granted = bound()
+                self._meanwhile()
+                return granted
+
+            return answered
+
+        def counted(address: Address, name: str) -> Handle:
+            self.renewed += name == "renew"
+            return service_of(address, name)
+
+        monkeypatch.setattr(keeper, "_ask", then_frozen)
+        monkeypatch.setattr(keeper, "_service", counted)
+
+
+@pytest.mark.parametrize("ended_s", [1.75, 5.0])
+def test_S12_a_grant_that_ended_while_its_client_was_frozen_makes_no_lock(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, ended_s: float
+) -> None:
+    """Its lease has not ended, but its session has, and another client has the joint: only a renewal shows that."""
+    table = robot.system.container("a")._parts.locks
+    next_owner = robot.other.lock([robot.find("a", whose=robot.other)], wait_s=20, lease_s=60)
+
+    def meanwhile() -> None:
+        robot.system.advance(ended_s)
+        [info] = table.infos()
+        table.session_ended(info.holder.session, "its link is lost")
+        next_owner.acquire()
+
+    Frozen(robot, monkeypatch, meanwhile)
+    lock = robot.me.lock([robot.find("a")], wait_s=20, lease_s=60)
+    with pytest.raises(errors.LockLost, match="its link is lost"):
+        lock.acquire()
+    assert not lock.held
+    assert next_owner.held
+    next_owner.release()
+
+
+@pytest.mark.parametrize(("frozen_s", "renewals"), [(0.5, 0), (1.5, 1)])
+def test_S12_a_grant_is_renewed_before_it_counts_if_its_answer_was_read_late(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, frozen_s: float, renewals: int
+) -> None:
+    frozen = Frozen(robot, monkeypatch, lambda: robot.system.advance(frozen_s))
+    with robot.me.lock([robot.find("a")], lease_s=60) as lock:
+        assert lock.held
+        assert frozen.renewed == renewals
+        assert robot.find("a")(0.5) == 0.5
 
 
 @pytest.mark.parametrize("victim", ["a", "b"])
