@@ -3,7 +3,6 @@
 One call at a time for the latency, then 32 under way for the rate.
 """
 
-import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,7 +15,7 @@ from tests.bench._links import Peer
 from tests.bench._messages import BareCopies, BareMessages, BareMessagesThreads
 from tests.bench._others import Grpc, Pyro5, Rpyc
 from tests.bench._peers import BarePair, BareQuery, Tcp
-from tests.bench._places import own_folder
+from tests.bench._places import on_one_processor, own_folder
 from tests.bench._report import keep_point, print_skipped, print_target
 from tests.bench._ros1 import Rospy
 from tests.bench._trade import LocalTrade, Trade, TradeThreads
@@ -71,7 +70,7 @@ def run(n: int, rounds: int) -> None:
             results = measure(f"calls of {NAMES[size]}", peers, job, rounds)
             print_latency(f"remote call of {NAMES[size]}", results, job)
             _print_latency_targets(results, size)
-    with _on_one_processor(), up(_PEERS) as peers:
+    with on_one_processor(), up(_PEERS) as peers:
         title = f"remote call of {NAMES[_SMALL]}, both ends on one processor"
         job = Job(_SMALL, worth(n, rounds, _SIZES[_SMALL]))
         results = measure(f"calls of {NAMES[_SMALL]} on one processor", peers, job, rounds)
@@ -92,20 +91,6 @@ def run_in_flight(n: int, rounds: int) -> None:
 def worth(n: int, rounds: int, share: float) -> int:
     """Calls of a round, of those asked for."""
     return max(1, int(n * share), min(n, ceil(_ENOUGH / rounds)))
-
-
-@contextmanager
-def _on_one_processor() -> Iterator[None]:
-    """Processes that begin meanwhile stay on one processor, where the system lets a process choose."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
 
 
 @contextmanager

@@ -31,8 +31,9 @@ from trade.transport.base import (
     Transport,
 )
 from trade.transport.endpoints import Endpoint
+from trade.transport.session_ids import new_session_id
 from trade.transport.timer_slack import read_patiently
-from trade.transport.zenoh_links import Links, new_session_id, open_session
+from trade.transport.zenoh_links import Links, open_session
 from trade.transport.zenoh_prompt import Prompt
 
 _logger = logging.getLogger("trade")

@@ -11,7 +11,6 @@ import hmac
 import json
 import logging
 import math
-import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +25,7 @@ from trade.transport.credentials import dictionary_file
 from trade.transport.endpoints import Endpoint, dialled_from_here, loopback_interface
 from trade.transport.interfaces import OwnAddress, own_addresses
 from trade.transport.scouting import PEER, ROUTER, Beacon, scout
+from trade.transport.session_ids import dials_first, new_session_id
 from trade.transport.zenoh_prompt import Prompt
 
 _logger = logging.getLogger("trade")
@@ -35,11 +35,6 @@ WITHOUT_HUB: Final = (
     "host work without it"
 )
 _NO_PEERS: Final[dict[str, Any]] = {"router": [], "peer": []}
-_DIGITS: Final = 32
-_ORDER: Final = 6
-"""The bytes at the end of an id by which two are compared: a bit, and so many of the time in ticks of a microsecond."""
-_TICKS: Final = 8 * _ORDER - 1
-_TICK_NS: Final = 1_000
 _TAG: Final = 16
 _NAME: Final = 12
 """Hexadecimal digits. A beacon's id consists of its system's tag, this many digits of the main session's id, and the
@@ -50,24 +45,6 @@ _MOMENT_S: Final = 1.0
 _USER: Final = "transport/auth/usrpwd/user"
 _TLS: Final = "transport/link/tls"
 _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
-
-
-def new_session_id(began_ns: int | None = None, *, dials: bool = False) -> str:
-    """An id that zenoh keeps as it is written: its first digit is not zero.
-
-    Of two sessions that discover each other the one with the greater id dials; zenoh compares the last byte first. A
-    session that listens on this host only can dial others but cannot be dialled from elsewhere: its id is the greater.
-    Of two on one host, that is the one that began later, which dials the earlier one anyway (see `HostFolder`). If each
-    dials the other, both links end, and zenoh 1.10 may take the next one for ended, too, although it stays open.
-
-    Args:
-        began_ns: when the session's container began, in nanoseconds of the host's monotonic clock; None: now.
-        dials: whether it cannot be dialled from elsewhere.
-    """
-    began = (time.monotonic_ns() if began_ns is None else began_ns) // _TICK_NS % 2**_TICKS
-    order = (began + (dials << _TICKS)).to_bytes(_ORDER, "little")
-    digits = secrets.token_hex(_DIGITS // 2 - _ORDER)
-    return f"{secrets.choice('123456789abcdef')}{digits[1:]}{order.hex()}"
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
@@ -269,7 +246,11 @@ class Links:
         if not there.session.startswith(session):
             return LinkAttempt("", f"another container answers now ({there.session[:_NAME]})")
         ways = [self._introduced, self._prompted]
-        if self._prompt is not None and not self.bridges and (self.moved() or _dials_first(self._own, there)):
+        if (
+            self._prompt is not None
+            and not self.bridges
+            and (self.moved() or there.kind == ROUTER or dials_first(self._own, there.session))
+        ):
             ways.reverse()
         for way in ways:
             if self.linked(there.session) or way(there, wait_s, ended):
@@ -376,12 +357,6 @@ def _others(session: zenoh.Session) -> list[str]:
 def _dialled() -> set[str]:
     """The addresses of this host that others can dial."""
     return {own.ip for own in own_addresses() if own.dialled}
-
-
-def _dials_first(own: str, there: _AddressOwner) -> bool:
-    """Whether, of two sessions that hear of each other, this one dials: its id is the greater, last byte first."""
-    mine, other = (bytes.fromhex(session.zfill(_DIGITS))[::-1] for session in (own, there.session))
-    return there.kind == ROUTER or mine > other
 
 
 def _close(extra: zenoh.Session) -> None:
