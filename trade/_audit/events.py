@@ -11,7 +11,6 @@ from msgspec import Struct
 
 from trade._context.call_context import CallContext
 from trade._context.interceptor import Interceptor, ServedCall, ServedService
-from trade._context.sessions import foreign
 from trade._counters import CallCounters
 from trade.errors import (
     AccessDenied,
@@ -66,6 +65,7 @@ class Event(Struct, frozen=True, gc=False):
     who: str
     """Identity of the caller; empty: the event had no caller."""
     session: str
+    """Of the caller. The writer names the client of another system that it may belong to, instead of the caller."""
     call_id: int
     """0: the event was not a call."""
     outer_id: int
@@ -267,7 +267,7 @@ class Audited(Interceptor):
         if self._rule.about and (call.args or call.kwargs):
             about = call.args[0] if call.args else next(iter(call.kwargs.values()))
         now_ns, context = time.monotonic_ns(), call.context
-        who, session = foreign(context.session) or context.caller, context.session
+        who, session = context.caller, context.session
         took_ns = now_ns - began_ns if began_ns else 0
         at_ns, ids = time.time_ns(), (context.id, outer_id)
         self._tell(Event(at_ns, now_ns, kind, call.service.label, about, who, session, *ids, outcome, why, took_ns))

@@ -16,6 +16,7 @@ from typing import Any, Final
 from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow, Head
 from trade._audit.store import SUFFIX, AuditStore, Retention, move_aside
+from trade._context.sessions import foreign
 from trade._settings import Settings
 from trade.protocol.keys import Address, ServiceKey
 
@@ -253,7 +254,7 @@ def _row_of(event: Event, boot: str) -> AuditRow:
         event.kind,
         _clipped(event.what),
         _clipped(_text(event.about)),
-        _clipped(event.who),
+        _clipped(foreign(event.session) or event.who),
         _clipped(event.session),
         event.call_id & _MOST_ID,
         event.outer_id & _MOST_ID,

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from trade._audit.events import Audit
-from trade._context.sessions import foreign
 from trade._estop.deadman import Deadman
 from trade._estop.ledger import Ledger, age, as_reported, identity_of
 from trade._estop.store import EstopStore
@@ -146,9 +145,8 @@ class EstopLatch:
 
     def _begin(self, estop: Estop) -> None:
         reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
-        identity = foreign(estop.by) or identity_of(estop)
         why = f"{estop.reason} (reported by {estop.told_by})".lstrip() if estop.told_by else estop.reason
-        self._audit.note("stop", "e-stop", about=estop.id, who=identity, session=estop.by, why=why)
+        self._audit.note("stop", "e-stop", about=estop.id, who=identity_of(estop), session=estop.by, why=why)
         with self._guard:
             self._latch()
             fresh = self._round is None or not self._round.serves

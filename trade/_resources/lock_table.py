@@ -13,7 +13,7 @@ from typing import Final
 from msgspec import structs
 
 from trade._audit.events import Audit
-from trade._context.sessions import EndedSessions, foreign, within
+from trade._context.sessions import EndedSessions, within
 from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, StopInfo, Waiter, withheld
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
 from trade._threads.scheduler import Scheduler
@@ -386,8 +386,7 @@ class LockTable:
 
     def _record(self, event: str, grant: Grant, reason: str = "") -> None:
         names, holder = [resource.name for resource in grant.resources], grant.holder
-        identity = foreign(holder.session) or holder.identity
-        self._audit.note("lock", event, about=names, who=identity, session=holder.session, why=reason)
+        self._audit.note("lock", event, about=names, who=holder.identity, session=holder.session, why=reason)
 
     def _stopped(self, resource: Resource, problem: str) -> None:
         with self._changed:

@@ -332,7 +332,7 @@ class Dispatcher:
     def _note(self, label: str, error: TradeError, incoming: IncomingCall) -> None:
         """Record that a call was refused."""
         call = incoming.call
-        who, outer_id = foreign(call.session) or incoming.caller, outer_of(call.id, call.behalf)
+        who, outer_id = incoming.caller, outer_of(call.id, call.behalf)
         self._audit.refused(label, error, who=who, session=call.session, call_id=call.id, outer_id=outer_id)
 
     def _take(self, message: Message) -> IncomingCall | None:

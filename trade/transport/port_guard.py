@@ -81,7 +81,7 @@ class PortGuard:
         self._links = links
         self._far_ends = far_ends
         self._limit = most
-        self._sockets = _own_sockets(partial(_is_guarded, ports=self._ports)) if _POSSIBLE else []
+        self._sockets = own_sockets(partial(_is_guarded, ports=self._ports)) if _POSSIBLE else []
         self._shut = frozenset[int]()
         """The sockets that accept no new connection now, by their places."""
         self._flood: _Flood | None = None
@@ -171,8 +171,8 @@ class PortGuard:
             sock.close()
 
 
-def _own_sockets(chosen: Callable[[socket.socket], bool]) -> list[socket.socket]:
-    """Copies of the sockets of this process that are chosen."""
+def own_sockets(chosen: Callable[[socket.socket], bool]) -> list[socket.socket]:
+    """Copies of the sockets of this process that are chosen; the caller closes them. Linux only."""
     found: dict[int, socket.socket] = {}
     for file in list(_OPEN_FILES.iterdir()):
         with contextlib.ExitStack() as unless_chosen, contextlib.suppress(OSError, ValueError):
@@ -201,7 +201,7 @@ def _ended(connections: Collection[tuple[_End, _End]]) -> int:
     def is_one(sock: socket.socket) -> bool:
         return _is_tcp(sock) and (_end(*sock.getpeername()[:2]), _end(*sock.getsockname()[:2])) in connections
 
-    ended = _own_sockets(is_one)
+    ended = own_sockets(is_one)
     for sock in ended:
         with sock, contextlib.suppress(OSError):  # its other end has just ended it
             sock.shutdown(socket.SHUT_RDWR)

@@ -8,22 +8,22 @@ _DIGITS: Final = 32
 _ORDER: Final = 6
 """The bytes at the end of an id by which two are compared: a bit, and so many of the time in microseconds."""
 _TIME_BITS: Final = 8 * _ORDER - 1
-_US_NS: Final = 1_000
+_NS_PER_US: Final = 1_000
 
 
 def new_session_id(began_ns: int | None = None, *, dials: bool = False) -> str:
     """An id that zenoh keeps as it is written: its first digit is not zero.
 
-    Of two sessions that discover each other the one with the greater id dials; zenoh compares the last byte first. A
-    session that listens on this host only can dial others but cannot be dialled from elsewhere: its id is the greater.
-    Of two on one host, that is the one that began later, which dials the earlier one anyway (see `HostFolder`). If each
-    dials the other, both links end, and zenoh 1.10 may take the next one for ended, too, although it stays open.
+    zenoh compares the last byte first. A session that listens on this host only can dial others but cannot be dialled
+    from elsewhere: its id is the greater. Otherwise that of the session that began later is, because it dials the
+    earlier ones of its host anyway (see `HostFolder`). If each dialled the other, both links would end, and zenoh 1.10
+    may take the next one for ended, too, although it stays open.
 
     Args:
         began_ns: when the session's container began, in nanoseconds of the host's monotonic clock; None: now.
         dials: whether it cannot be dialled from elsewhere.
     """
-    began = (time.monotonic_ns() if began_ns is None else began_ns) // _US_NS % 2**_TIME_BITS
+    began = (time.monotonic_ns() if began_ns is None else began_ns) // _NS_PER_US % 2**_TIME_BITS
     order = (began + (dials << _TIME_BITS)).to_bytes(_ORDER, "little")
     digits = secrets.token_hex(_DIGITS // 2 - _ORDER)
     return f"{secrets.choice('123456789abcdef')}{digits[1:]}{order.hex()}"

@@ -10,18 +10,16 @@ drops what anybody else sends (S21). Linux only: that takes the list of open fil
 
 import contextlib
 import itertools
-import os
 import socket
 import sys
 import threading
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Final
 
 from trade.transport.endpoints import loopback_interface
+from trade.transport.port_guard import own_sockets
 from trade.transport.scouting import PEER, hello
 
-_OPEN_FILES: Final = Path("/proc/self/fd")
 _HERE: Final = "127.0.0.1"
 _marks: Final = itertools.cycle(range(100, 250))
 """No datagram leaves this host, so the time to live is free to tell which socket is whose."""
@@ -66,16 +64,11 @@ class Prompt:
 
     def secure(self) -> bool:
         """Let the opened session hear only us; returns whether its socket was found."""
-        for file in list(_OPEN_FILES.iterdir()):
-            with contextlib.suppress(OSError, ValueError):
-                if not str(file.readlink()).startswith("socket:"):
-                    continue
-                with socket.socket(fileno=os.dup(int(file.name))) as copy:
-                    if self._is_marked(copy):
-                        copy.connect(self._socket.getsockname())
-                        self._asked_by = (_HERE, copy.getsockname()[1])
-                        return True
-        return False
+        for copy in own_sockets(self._is_marked):
+            with copy, contextlib.suppress(OSError):
+                copy.connect(self._socket.getsockname())
+                self._asked_by = (_HERE, copy.getsockname()[1])
+        return self._asked_by is not None
 
     def _is_marked(self, sock: socket.socket) -> bool:
         if sock.family != socket.AF_INET or sock.type != socket.SOCK_DGRAM or sock.getsockname()[0] == _HERE:

@@ -401,6 +401,20 @@ print(steps, verdict.head.seq)
     assert rows > steps  # most of those that were ended had added something
 
 
+@pytest.mark.parametrize(
+    ("session", "who"),
+    [
+        ("door/guest/1f/clinic:anna.7", "clinic/anna via door"),
+        ("door/guest/1f/7", "door"),
+        ("door", "door"),
+        ("", "door"),
+    ],
+)
+def test_a_row_names_the_client_of_another_system_instead_of_the_door(session: str, who: str) -> None:
+    row = writing._row_of(Event(1, 1, "lock", "locked", "", "door", session, 7, 3, "ok", "", 5), "boot")
+    assert (row.who, row.session) == (who, session)
+
+
 @pytest.mark.realtime
 def test_its_process_killed_under_load_leaves_a_record_that_verifies_and_can_be_added_to(path: Path) -> None:
     program = f"""

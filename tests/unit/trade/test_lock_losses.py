@@ -9,9 +9,11 @@ import pytest
 from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
 from trade import Handle, errors, where
+from trade._locks.lease_client import _FRESH_S
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.resource import Latch
 from trade.protocol.keys import Address
+from trade.transport.zenoh import configuration
 
 pytestmark = pytest.mark.virtual_time
 
@@ -81,6 +83,13 @@ def test_S12_a_grant_is_renewed_before_it_counts_if_its_answer_was_read_late(
         assert lock.held
         assert frozen.renewed == renewals
         assert robot.find("a")(0.5) == 0.5
+
+
+def test_S12_no_session_of_a_client_ends_as_long_as_its_grant_counts_as_fresh() -> None:
+    """A link ends a lease after the last sign of life, and that may be one period older than the request."""
+    settings = configuration(namespace="lab", listen=[], connect=[])
+    lease_ms = settings["transport/link/tx/lease"]
+    assert lease_ms - lease_ms / settings["transport/link/tx/keep_alive"] > 1000 * _FRESH_S
 
 
 @pytest.mark.parametrize("victim", ["a", "b"])
