@@ -5,7 +5,6 @@ same on any implementation; ``zenoh`` is the real one.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 from msgspec import Raw, Struct
 
@@ -150,7 +149,7 @@ class Transport(ABC):
         """Receive the queries for keys that match."""
 
     @abstractmethod
-    def ask(self, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
+    def ask(self, patterns: list[str], timeout_s: float) -> list[Answer]:
         """Query all other transports at once; returns their replies when all are done or the timeout has passed.
 
         A transport that is lost meanwhile is not waited for. Each pattern is a query of its own;

@@ -336,7 +336,7 @@ class ZenohTransport(Transport):
         with _refusing():
             return ZenohQuestions(self._session.declare_queryable(pattern, _fifo()))
 
-    def ask(self, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
+    def ask(self, patterns: list[str], timeout_s: float) -> list[Answer]:
         with _refusing():
             queries = [self._query(pattern, timeout_s) for pattern in patterns]
         return _by_replier(itertools.chain.from_iterable(queries))

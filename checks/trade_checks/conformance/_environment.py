@@ -196,7 +196,7 @@ class Stage:
 
     def ask(self, pattern: str) -> list[Answer]:
         """Returns the answers to a registry query."""
-        return [answer for answer in self._transport.ask(pattern, 2.0) if answer.messages]
+        return [answer for answer in self._transport.ask([pattern], 2.0) if answer.messages]
 
     @contextlib.contextmanager
     def listening(self, pattern: str) -> Generator[list[Any], None, None]:

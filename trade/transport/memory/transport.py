@@ -1,6 +1,6 @@
 """The transport interface on a network in memory."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from trade.transport.base import Answer, Channel, ChannelClosed, Message, Presence, Publisher, Questions, Transport
@@ -81,7 +81,7 @@ class MemoryTransport(Transport):
             self.node.asked.append(questions)
             return questions
 
-    def ask(self, patterns: Sequence[str], timeout_s: float) -> list[Answer]:
+    def ask(self, patterns: list[str], timeout_s: float) -> list[Answer]:
         return self.network.ask(self.node, patterns, timeout_s)
 
     def appear(self, key: str) -> Presence:
