@@ -306,8 +306,8 @@ class Container:
 
     @property
     def catching_up(self) -> bool:
-        """Whether it is requesting registry entries that it may have missed."""
-        return self._parts.watch.busy
+        """Whether it is requesting registry entries that it may have missed, or has yet to announce its own."""
+        return self._parts.watch.busy or not self._parts.announcer.is_introduced
 
     def healthy(self) -> bool:
         """Whether it can take a call now; code that feeds hardware watchdogs checks this."""

@@ -45,6 +45,11 @@ class Announcer:
         self._is_announced = not self._transport.relayed
         return self._transport.appear(alive_key(self._own))
 
+    @property
+    def is_introduced(self) -> bool:
+        """Whether announcements are sent."""
+        return self._is_announced
+
     def introduce(self) -> None:
         """Announce all that there is, and the revision: who hears all of it needs no query.
 

@@ -1,14 +1,16 @@
 """Behind a hub, a container that begins announces all that it has, and no other has to query it."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 import pytest
 
 from tests.unit.trade.lamp_provider import Lamp
 from trade import where
+from trade._discovery import resync
 from trade._registry.revision_tracker import RevisionTracker
 from trade.protocol.keys import TALLY
-from trade.testing import MemorySystem, MessageKind, memory_system
+from trade.testing import MemorySystem, MessageKind, VirtualTime, memory_system
 from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
@@ -25,13 +27,20 @@ def _behind_a_hub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MemoryTransport, "relayed", True)
 
 
+@pytest.fixture
+def _punctually() -> None:
+    """Others query what has not introduced itself within moments."""
+    if VirtualTime.current() is None:
+        pytest.skip("it judges by moments: on the real clock, threads also wait for a processor")
+
+
 class Queries:
-    """The queries in a system, and how many were open at the same time."""
+    """The queries in a system, and how many one container had open at the same time."""
 
     def __init__(self, system: MemorySystem) -> None:
         self.of: list[tuple[str, str]] = []
         self.most = 0
-        self._open = 0
+        self._open = Counter[str]()
         system.tap(self._see)
 
     def _see(self, message: InFlightMessage) -> None:
@@ -39,10 +48,10 @@ class Queries:
             return
         if message.kind is MessageKind.ASK:
             self.of.append((message.source, message.target))
-            self._open += 1
-            self.most = max(self.most, self._open)
+            self._open[message.source] += 1
+            self.most = max(self.most, self._open[message.source])
         elif message.kind is MessageKind.ANSWER and message.key.endswith(f"/{TALLY}"):
-            self._open -= 1
+            self._open[message.target] -= 1
 
     def to(self, name: str) -> list[str]:
         return [asking for asking, asked in self.of if asked == name]
@@ -60,7 +69,7 @@ def begin(system: MemorySystem, count: int) -> list[str]:
     return names
 
 
-@pytest.mark.usefixtures("_behind_a_hub")
+@pytest.mark.usefixtures("_behind_a_hub", "_punctually")
 def test_a_container_that_begins_is_not_queried_and_queries_all_others(system: MemorySystem) -> None:
     queries = Queries(system)
     names = begin(system, 6)
@@ -77,7 +86,7 @@ def test_with_links_of_their_own_all_query_one_that_begins(system: MemorySystem)
     assert sorted(queries.to("c3")) == names[:3]
 
 
-@pytest.mark.usefixtures("_behind_a_hub")
+@pytest.mark.usefixtures("_behind_a_hub", "_punctually")
 @pytest.mark.parametrize("lost", ["system", "tally"])
 def test_one_that_missed_a_part_queries(system: MemorySystem, lost: str) -> None:
     names, queries = begin(system, 3), Queries(system)
@@ -134,7 +143,7 @@ def test_what_opens_again_needs_an_answer_whatever_it_announced_before() -> None
     assert tracker.complete
 
 
-@pytest.mark.usefixtures("_behind_a_hub")
+@pytest.mark.usefixtures("_behind_a_hub", "_punctually")
 def test_what_was_withdrawn_before_the_introduction_leaves_a_gap_for_which_others_query(system: MemorySystem) -> None:
     lamp, reader = Lamp(), system.container("reader")
     queries = Queries(system)
@@ -145,3 +154,19 @@ def test_what_was_withdrawn_before_the_introduction_leaves_a_gap_for_which_other
     system.settle()
     assert queries.to("arm") == ["reader"]
     assert [handle.key.provider for handle in reader.services(where(name="dim"))] == ["Lamp-2"]
+
+
+@pytest.mark.usefixtures("_behind_a_hub")
+def test_a_system_has_settled_when_all_have_introduced_themselves(
+    system: MemorySystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if others queried them before that, and what they register was not announced yet."""
+    monkeypatch.setattr(resync, "_INTRODUCTION_S", 0.2)
+    reader = system.container("reader")
+    monkeypatch.setattr(reader._parts.transport, "relayed", False)  # it does not wait for introductions
+    arm = system.container("arm")
+    system.drive(lambda: not reader.catching_up)
+    arm.register(Lamp(), "lamps.arm")
+    assert reader.services(where(name="dim")) == []
+    system.settle()
+    assert len(reader.services(where(name="dim"))) == 1
