@@ -25,6 +25,10 @@ class QueuedBus(SocketCanDaemonBus):
     """Nothing acknowledges a frame, so none leaves the queue."""
     error: ClassVar[int]
     """The class of the errors that the controller reports while nothing is received (linux/can/error.h); 0: none."""
+    full_every: ClassVar[int]
+    """Of so many frames, one finds the queue full however idle the wire is; 0: none does."""
+    offers: ClassVar[int]
+    """Frames that the queue was to take."""
     refused: ClassVar[int]
     """Frames that found the queue full."""
 
@@ -41,7 +45,8 @@ class QueuedBus(SocketCanDaemonBus):
     @classmethod
     def reset(cls, length: int = 10, frame_s: float = 0.0) -> None:
         cls.length, cls.frame_s = length, frame_s
-        cls.stuck, cls.error, cls.refused = False, 0, 0
+        cls.stuck, cls.error, cls.full_every = False, 0, 0
+        cls.offers = cls.refused = 0
 
     def __init__(self, channel: str, **_: Any) -> None:
         address, _, name = channel.partition("/")
@@ -52,7 +57,8 @@ class QueuedBus(SocketCanDaemonBus):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._drain()
-        if len(self._waiting) >= self.length:
+        type(self).offers += 1
+        if len(self._waiting) >= self.length or (self.full_every and self.offers % self.full_every == 0):
             type(self).refused += 1
             raise can.CanOperationError("Failed to transmit: No buffer space available", ENOBUFS)
         self._waiting.append(msg)

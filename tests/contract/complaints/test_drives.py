@@ -74,7 +74,7 @@ def test_a_short_send_queue_ends_a_motion(body: Body) -> None:
         port, bus = body.rig.sim.port.replace("socketcand", "queued"), body.rig.robot.buses[0].name
         group = body.attach(ports={bus: port}).group(body.rig.robot.groups[0].name)
         group.enable()
-        QueuedBus.reset(length=1, frame_s=0.002)
+        QueuedBus.full_every = 5
         refusal = outcome(lambda: group.move_to([0.3, 0.3]))
         assert QueuedBus.refused
         assert not refusal, f"a frame that had to wait ended the motion: {refusal}"
