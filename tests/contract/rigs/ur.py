@@ -93,11 +93,14 @@ class UrRig(SafetyRig):
 
     def judge_ended(self) -> None:
         rested = written_now()
+        wait_until(self._halts, "it is halted")  # it also rests when a set-point of a stream is late
         self.bench.comes_to_rest()
-        ended = [*instructions(self.bench.log, "stop_j"), *instructions(self.bench.log, "servo_stop")]
-        assert ended
+        ended = self._halts()
         wait_until(lambda: answers(self.device, rested + 0.5), "time has passed")
         assert not self.bench.moves(max(rested, ended[-1].t))
+
+    def _halts(self) -> list[LogEntry]:
+        return [*instructions(self.bench.log, "stop_j"), *instructions(self.bench.log, "servo_stop")]
 
     def under_way(self) -> None:
         wait_until(lambda: self.bench.base_rad > 0.05, "it is under way")
