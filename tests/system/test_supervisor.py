@@ -44,7 +44,7 @@ def test_P70_a_child_that_is_killed_is_back_with_its_state(keeping: Callable[...
     again = kept.become("a", "up", restarts=1)
     assert again.pid != first.pid
     assert call("shown") == 2
-    assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.1 s", f"a is back, process {again.pid}"]
+    assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.05 s", f"a is back, process {again.pid}"]
 
 
 def test_a_restarted_child_resumes_from_its_last_reported_save(keeping: Callable[..., Keeping]) -> None:
@@ -68,7 +68,7 @@ def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., K
     assert kept.texts()[1:4] == [
         "a is asked to shut down: it did not answer within 1 s",
         "a does not shut down and is killed",
-        "a crashed (signal 9); back in 0.1 s",
+        "a crashed (signal 9); back in 0.05 s",
     ]
 
 
