@@ -123,6 +123,13 @@ def _no_priority(patch: Patch) -> None:
     patch(api, "LockRequest", lambda **terms: request(**{**terms, "priority": 0}))
 
 
+def _grant_unconfirmed(patch: Patch) -> None:
+    """A grant counts however late its answer is read."""
+    from trade._locks.lease_client import LeaseClient
+
+    patch(LeaseClient, "_confirm", lambda self, *_: None)
+
+
 def _busiest(patch: Patch) -> None:
     """What is moved goes where there is most to do."""
     from trade._migration import source as _departing
@@ -227,6 +234,7 @@ HOW: Final[dict[str, Callable[[Patch], None]]] = {
     "discovery-stays-on": _discovery_stays_on,
     "uses-uncounted": _uses_uncounted,
     "no-priority": _no_priority,
+    "grant-unconfirmed": _grant_unconfirmed,
     "busiest": _busiest,
     "busiest-picked": _busiest_picked,
     "twin-unplaced": _twin_unplaced,
