@@ -88,12 +88,19 @@ class View:
         self.message = self.pan.get_by_role("status")
 
     def hold(self, what: Any) -> None:
-        """Press with the mouse and do not let go."""
-        expect(what).to_be_enabled()
-        what.scroll_into_view_if_needed()
-        what.hover()
-        self.page.mouse.down()
-        expect(what).to_be_focused()
+        """Press with the mouse and do not let go; again if the page was just about to show what it has learnt."""
+
+        def taken() -> bool:
+            expect(what).to_be_enabled()
+            what.scroll_into_view_if_needed()
+            what.hover()
+            self.page.mouse.down()
+            if what.evaluate("button => button === document.activeElement"):
+                return True
+            self.page.mouse.up()
+            return False
+
+        wait_until(taken, "the button takes the press")
 
     def sign_in(self, token: str) -> None:
         self.page.get_by_label("Token").fill(token)
