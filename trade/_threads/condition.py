@@ -1,13 +1,18 @@
 """A condition variable that Ctrl-C can interrupt safely.
 
 A condition of the standard library breaks if Ctrl-C arrives after it releases its lock and before it waits: the user
-then sees a RuntimeError. A bare lock has no such moment.
+then sees a RuntimeError. A bare lock has no such moment. But CPython does not end the wait for a lock if the interrupt
+arrives just before it, or in another thread. So the main thread looks from time to time.
 """
 
 import contextlib
 import threading
 import time
 from collections.abc import Callable
+from typing import Final
+
+_INTERRUPT_S: Final = 0.5
+"""The longest time until an interrupt is noticed."""
 
 
 class InterruptibleCondition:
@@ -28,12 +33,13 @@ class InterruptibleCondition:
         gate = threading.Lock()
         gate.acquire()
         self._gates.add(gate)
+        longest_s = _INTERRUPT_S if threading.current_thread() is threading.main_thread() else threading.TIMEOUT_MAX
         try:
             while not ready():
-                left = -1 if until is None else until - time.monotonic()
-                if until is not None and left <= 0:
+                left_s = longest_s if until is None else until - time.monotonic()
+                if left_s <= 0:
                     return False
-                gate.acquire(timeout=left)
+                gate.acquire(timeout=min(left_s, longest_s))
             return True
         finally:
             self._gates.discard(gate)

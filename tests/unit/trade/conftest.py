@@ -76,6 +76,10 @@ class Program:
         tasks = Path(f"/proc/{self.process.pid}/task")
         wait_until(lambda: all(" T " in (task / "stat").read_text() for task in tasks.iterdir()))
 
+    def sleeps(self) -> bool:
+        """Whether its main thread waits now."""
+        return " S " in Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii")
+
     def thaw(self) -> None:
         self.process.send_signal(signal.SIGCONT)
 

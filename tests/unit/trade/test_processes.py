@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import trade
+from tests.support.waiting import wait_until
 from trade import Container, Settings, service, where
 from trade._container import default
 from trade.errors import ConfigurationError, NoSuchService
@@ -280,6 +281,35 @@ def test_an_interrupt_ends_waiting_for_a_started_call_and_for_a_service(
     for _ in range(2):
         assert program.heard() == "waiting"
         program.process.send_signal(signal.SIGINT)
+        assert program.heard() == "interrupted"
+    assert program.ends() == 0
+
+
+def test_an_interrupt_that_another_thread_receives_ends_these_waits_too(
+    start_program: Any, here: Container, gate: Any
+) -> None:
+    """As one does that arrives just before the wait: it wakes nothing."""
+    here.register(gate, "robot")
+    program = start_program(
+        """
+        import signal, threading
+        def interrupt():
+            hear()
+            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+        run = trade.find(where(name="pass_through"), wait_s=30).with_(deadline_s=3600).start()
+        for wait in (run.result, lambda: trade.find(where(name="nothing"), wait_s=3600)):
+            threading.Thread(target=interrupt).start()
+            try:
+                say("waiting")
+                wait()
+            except KeyboardInterrupt:
+                say("interrupted")
+        """
+    )
+    for _ in range(2):
+        assert program.heard() == "waiting"
+        wait_until(program.sleeps, "it waits")
+        program.tell()
         assert program.heard() == "interrupted"
     assert program.ends() == 0
 
