@@ -8,9 +8,8 @@ import signal
 import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 
 import msgspec
 
@@ -158,11 +157,8 @@ class _Stop:
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_write, False)
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        with suppress(OSError):
-            os.write(self._wake_write, b"!")
+            signal.signal(number, lambda _number, _frame: None)  # else it ends the process
+        signal.set_wakeup_fd(self._wake_write, warn_on_full_buffer=False)  # also for one that comes just before a wait
 
     def wait(self, parent: int | None, stdin: int | None) -> None:
         """Return when the simulator must end."""
@@ -188,6 +184,7 @@ class _Stop:
         """Restore the signal handlers and close the pipe."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
+        signal.set_wakeup_fd(-1)
         os.close(self._wake_read)
         os.close(self._wake_write)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 _INTERRUPT_S: Final = 0.5
-"""The longest time until an interrupt is noticed."""
+"""The longest time until the main thread notices an interrupt that did not end its wait."""
 
 
 class InterruptibleCondition:
@@ -33,13 +33,13 @@ class InterruptibleCondition:
         gate = threading.Lock()
         gate.acquire()
         self._gates.add(gate)
-        longest_s = _INTERRUPT_S if threading.current_thread() is threading.main_thread() else threading.TIMEOUT_MAX
         try:
             while not ready():
-                left_s = longest_s if until is None else until - time.monotonic()
+                left_s = threading.TIMEOUT_MAX if until is None else until - time.monotonic()
                 if left_s <= 0:
                     return False
-                gate.acquire(timeout=min(left_s, longest_s))
+                looks = threading.current_thread() is threading.main_thread()
+                gate.acquire(timeout=min(left_s, _INTERRUPT_S if looks else threading.TIMEOUT_MAX))
             return True
         finally:
             self._gates.discard(gate)

@@ -158,13 +158,19 @@ class LocalConnection:
             self._room[: end - begin] = self._room[begin:end]
             self._begin, self._end = 0, end - begin
             end -= begin
-        try:
-            got = self._sock.recv_into(self._view[end:])
-        except OSError:
-            raise ConnectionEnded from None
-        if not got:
-            raise ConnectionEnded
-        self._end += got
+        self._end += self._receive_into(self._view[end:])
+
+    def _receive_into(self, place: memoryview) -> int:
+        while True:
+            try:
+                got = self._sock.recv_into(place)
+            except BlockingIOError:  # a look for an interrupt
+                continue
+            except OSError:
+                raise ConnectionEnded from None
+            if not got:
+                raise ConnectionEnded
+            return got
 
     def _receive_large(self, begin: int, size: int) -> bytes:
         """A payload that the room is too small for: all that the room still has, and then what follows.
@@ -176,13 +182,7 @@ class LocalConnection:
         payload[:got] = self._view[begin : self._end]
         self._begin = self._end = 0
         while got < size:
-            try:
-                more = self._sock.recv_into(payload[got:])
-            except OSError:
-                raise ConnectionEnded from None
-            if not more:
-                raise ConnectionEnded
-            got += more
+            got += self._receive_into(payload[got:])
         return cast("bytes", payload)
 
     @property

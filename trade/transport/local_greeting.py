@@ -18,6 +18,8 @@ from trade.transport.local_connection import ConnectionEnded, LocalConnection
 from trade.transport.shared_segment import SharedSegment
 
 _ANSWER_S: Final = 1.0
+_INTERRUPT_S: Final = 0.5
+"""How often a caller that waits returns to the interpreter. A Ctrl-C that came just before it waited ends it then."""
 _MOST_GREETING_BYTES: Final = 4096
 _MOST_DESCRIPTORS: Final = 2
 """One more than a greeting may have."""
@@ -93,7 +95,9 @@ class Passport:
             connection = LocalConnection(sock)
             _send(connection, Greeting(PROTOCOL, self.own, reply, stops, proof, shared), large=large)
             if shared:
-                _limit_sends(sock)  # others want to send, too
+                _limit(sock, socket.SO_SNDTIMEO, _ANSWER_S)  # others want to send, too
+            else:
+                _limit(sock, socket.SO_RCVTIMEO, _INTERRUPT_S)
         except ConnectionEnded:
             sock.close()
             raise ConnectionResetError from None
@@ -127,7 +131,7 @@ class Passport:
             if segment is not None:
                 connection.take(segment)
             sock.settimeout(None)
-            _limit_sends(sock)
+            _limit(sock, socket.SO_SNDTIMEO, _ANSWER_S)
         except ConnectionEnded:
             sock.close()
             raise ConnectionResetError from None
@@ -195,6 +199,7 @@ def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
     return received, descriptors
 
 
-def _limit_sends(sock: socket.socket) -> None:
-    """Lets a message wait a second at most for an end that does not read."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack(_TIMEVAL, int(_ANSWER_S), 0))
+def _limit(sock: socket.socket, option: int, limit_s: float) -> None:
+    """Limits how long a message waits for an end that does not read, or the receiving thread for a message."""
+    seconds, rest_s = divmod(limit_s, 1)
+    sock.setsockopt(socket.SOL_SOCKET, option, struct.pack(_TIMEVAL, int(seconds), int(rest_s * 1e6)))

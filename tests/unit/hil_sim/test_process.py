@@ -1,19 +1,21 @@
 """The simulator as a process of its own: ready line, clean end, and no life after its parent."""
 
 import json
+import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 import serial
 
+from tests.support.signals import signal_another_thread
 from tests.support.waiting import wait_until
 from trade_hil_sim import Command, SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
 from trade_hil_sim.__main__ import main
@@ -75,7 +77,11 @@ def test_faults_come_in_while_it_runs(robot_file: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize("send", [os.kill, signal_another_thread])
+def test_a_signal_ends_it_cleanly(
+    robot_file: Path, tmp_path: Path, number: signal.Signals, send: Callable[[int, int], None]
+) -> None:
+    """One that another thread receives wakes no wait, nor does one that arrives just before the wait."""
     place = tmp_path / "d"
     with subprocess.Popen([*COMMAND, str(robot_file), "--dir", str(place)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -87,7 +93,8 @@ def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: sign
             "control": str(place / "_control"),
         }
         assert sorted(p.name for p in place.iterdir()) == ["_control", "arm", "neck"]
-        process.send_signal(number)
+        wait_until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_SLEEPING, "it waits")
+        send(process.pid, number)
         assert process.wait(20) == 0
     assert list(place.iterdir()) == []
 

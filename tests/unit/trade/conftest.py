@@ -172,12 +172,14 @@ class Gate:
         self.entered = threading.Event()
         self.open = threading.Event()
         self.runs = 0
+        self.passed = 0
 
     @service
     def pass_through(self) -> str:
         self.runs += 1
         self.entered.set()
         self.open.wait(30)
+        self.passed += 1
         return "through"
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import trade
+from tests.support.signals import signal_another_thread
 from tests.support.waiting import wait_until
 from trade import Container, Settings, service, where
 from trade._container import default
@@ -236,9 +237,27 @@ def test_a_process_may_end_while_another_thread_closes_its_containers(start_prog
     assert (program.ends(), program.errors()) == (0, "")
 
 
-def test_an_interrupt_ends_a_blocked_call_at_once_and_the_next_call_works(
-    start_program: Any, here: Container, gate: Any
+SENDERS = {
+    "to the main thread": lambda program: program.process.send_signal(signal.SIGINT),
+    "to another thread": lambda program: signal_another_thread(program.process.pid, signal.SIGINT),
+}
+"""An interrupt that another thread receives wakes no wait, nor does one that arrives just before the wait."""
+
+
+@pytest.fixture(params=SENDERS.values(), ids=list(SENDERS))
+def interrupt(request: pytest.FixtureRequest) -> Any:
+    def send(program: Any) -> None:
+        wait_until(program.sleeps, "it waits")
+        request.param(program)
+
+    return send
+
+
+@pytest.mark.parametrize("path", ["local", "transport"])
+def test_an_interrupt_ends_a_blocked_call_and_the_next_call_works(
+    start_program: Any, here: Container, gate: Any, interrupt: Any, path: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("TRADE_LOCAL_PATH", str(int(path == "local")))
     here.register(gate, "robot")
     here.register(Lamp(), "robot")
     program = start_program(
@@ -254,8 +273,9 @@ def test_an_interrupt_ends_a_blocked_call_at_once_and_the_next_call_works(
         """
     )
     assert gate.entered.wait(30)
-    program.process.send_signal(signal.SIGINT)
+    interrupt(program)
     assert program.heard() == "interrupted"
+    assert not gate.passed  # else the answer ended the wait
     gate.open.set()
     program.tell()
     assert program.heard() == "[0.5, 0.5, 0.5] through"
@@ -263,42 +283,13 @@ def test_an_interrupt_ends_a_blocked_call_at_once_and_the_next_call_works(
 
 
 def test_an_interrupt_ends_waiting_for_a_started_call_and_for_a_service(
-    start_program: Any, here: Container, gate: Any
+    start_program: Any, here: Container, gate: Any, interrupt: Any
 ) -> None:
     here.register(gate, "robot")
     program = start_program(
         """
-        blocked = trade.find(where(name="pass_through"), wait_s=30).with_(deadline_s=3600)
-        run = blocked.start()
-        for wait in (run.result, lambda: trade.find(where(name="nothing"), wait_s=3600)):
-            try:
-                say("waiting")
-                wait()
-            except KeyboardInterrupt:
-                say("interrupted")
-        """
-    )
-    for _ in range(2):
-        assert program.heard() == "waiting"
-        program.process.send_signal(signal.SIGINT)
-        assert program.heard() == "interrupted"
-    assert program.ends() == 0
-
-
-def test_an_interrupt_that_another_thread_receives_ends_these_waits_too(
-    start_program: Any, here: Container, gate: Any
-) -> None:
-    """As one does that arrives just before the wait: it wakes nothing."""
-    here.register(gate, "robot")
-    program = start_program(
-        """
-        import signal, threading
-        def interrupt():
-            hear()
-            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
         run = trade.find(where(name="pass_through"), wait_s=30).with_(deadline_s=3600).start()
         for wait in (run.result, lambda: trade.find(where(name="nothing"), wait_s=3600)):
-            threading.Thread(target=interrupt).start()
             try:
                 say("waiting")
                 wait()
@@ -308,9 +299,9 @@ def test_an_interrupt_that_another_thread_receives_ends_these_waits_too(
     )
     for _ in range(2):
         assert program.heard() == "waiting"
-        wait_until(program.sleeps, "it waits")
-        program.tell()
+        interrupt(program)
         assert program.heard() == "interrupted"
+        assert not gate.passed
     assert program.ends() == 0
 
 
