@@ -1,13 +1,16 @@
 """Stories of robots on virtual time under drawn troubles: ``make explore SEEDS=500``, or one again: ``--first 17``.
 
-The exit code is 0 if no story breaks a rule, 1 if one does, 2 if the arguments are wrong, and 130 after Ctrl-C.
+The exit code is 0 if no story breaks a rule, 1 if one does, 2 if the arguments are wrong, and 130 after Ctrl-C,
+which lets the story that is played come to its end. A second Ctrl-C does not.
 """
 
 import argparse
+import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -71,21 +74,34 @@ def main(words: Sequence[str] | None = None) -> int:
     if asked.mutant:
         MUTANTS[asked.mutant]()
     found = Sum()
-    try:
+    with _interrupts() as interrupts, suppress(KeyboardInterrupt):
         for seed in range(asked.first, asked.first + asked.seeds):
             _play(seed, asked, found)
             found.tell(asked.seeds)
-            if asked.mutant and found.wrong:
+            if interrupts or (asked.mutant and found.wrong):
                 break
-    except KeyboardInterrupt:
+    if interrupts:
         print(f"interrupted after {found.stories} of {asked.seeds} stories", file=sys.stderr)
-        code = 130
-    else:
-        code = int(bool(found.wrong))
     print(found)
     took_s = time.monotonic() - found.began
     print(f"{took_s:.0f} s, {found.stories / max(took_s, 1e-9):.2f} stories a second", file=sys.stderr)
-    return code
+    return 130 if interrupts else int(bool(found.wrong))
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Collects the first Ctrl-C: as an exception it would be lost in the callback of a weak reference."""
+    come: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        come.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield come
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _play(seed: int, asked: argparse.Namespace, found: Sum) -> None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,30 @@ def test_another_process_with_another_hash_seed_prints_the_same() -> None:
         for hash_seed in (1, 2)
     ]
     assert said[0] == said[1]
+
+
+class Story:
+    """What a weak reference refers to."""
+
+
+def test_ctrl_c_is_noticed_wherever_it_arrives(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python ignores what is raised in the callback of a weak reference."""
+
+    def interrupted(seed: int, _only: list[int] | None) -> Outcome:
+        story = Story()
+        end = weakref.ref(story, lambda _: signal.raise_signal(signal.SIGINT))
+        del story
+        assert end() is None
+        return drawn(seed)
+
+    monkeypatch.setattr(command, "play", interrupted)
+    assert command.main(["--seeds", "30"]) == 130
+    said = capsys.readouterr()
+    assert "interrupted after 1 of 30 stories" in said.err
+    assert "1 stories, 0.010 virtual hours, 2 calls, 0 with a violation" in said.out
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.realtime
