@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 _PROCESSES: Final = Path("/proc")
-_TERMINALS: Final = "/dev/pts/"
+_TERMINALS: Final = range(136, 144)
+"""The major numbers of pseudo-terminals (Documentation/admin-guide/devices.txt of Linux)."""
 _MASTERS: Final = ("/dev/ptmx", "/dev/pts/ptmx")
 
 
@@ -27,7 +28,7 @@ def holders(path: str) -> list[str]:
         return []
     if not stat.S_ISCHR(status.st_mode):
         return []
-    terminal = os.path.realpath(path).startswith(_TERMINALS)
+    terminal = os.major(status.st_rdev) in _TERMINALS
     return [f"{_name(pid)} (pid {pid})" for pid in _pids() if _holds(pid, status.st_rdev, terminal=terminal)]
 
 

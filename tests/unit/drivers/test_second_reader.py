@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -140,3 +141,19 @@ def test_the_program_behind_a_pseudo_terminal_and_this_process_do_not_count(pair
     assert holders(pair.path) == []
     os.close(near)
     assert holders("/nowhere") == []
+
+
+def test_a_port_that_is_unplugged_while_its_holders_are_sought_has_none(
+    pair: Pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its link vanishes after the first look at it."""
+
+    def unplugged(path: str, *_: object, **__: object) -> str:
+        if path == str(port):
+            raise FileNotFoundError(path)
+        return read(path)
+
+    (port := tmp_path / "port").symlink_to(pair.path)
+    read = os.readlink
+    monkeypatch.setattr(os, "readlink", unplugged)
+    assert holders(str(port)) == []
