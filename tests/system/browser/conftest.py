@@ -84,11 +84,12 @@ class View:
         self.estop = page.get_by_role("button", name="E-STOP")
         self.pan = page.locator(f'[id="at-{PAN}"]')
         self.plus = self.pan.get_by_role("button", name="in the positive direction")
+        self.stop = self.pan.get_by_role("button", name="Stop")
         self.minus = self.pan.get_by_role("button", name="in the negative direction")
         self.message = self.pan.get_by_role("status")
 
     def hold(self, what: Any) -> None:
-        """Press with the mouse and do not let go; again if the page was just about to show what it has learnt."""
+        """Press with the mouse and do not let go; again if a service appeared, as the page is then built again."""
 
         def taken() -> bool:
             expect(what).to_be_enabled()

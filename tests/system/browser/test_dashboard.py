@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 import trade
 from tests.conftest import StartContainer
-from tests.support.waiting import wait_until
+from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
 from tests.system.conftest import Bench
 from trade import service
@@ -220,8 +220,15 @@ def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers:
     expect(anna.link).to_contain_text("Not connected")
     expect(anna.plus).to_be_disabled()
     anna.page.mouse.up()
-    http.start()
+    asked: list[Any] = []
+    anna.page.route("**/services", lambda route: asked.append(route))  # noqa: PLW0108 - it is inspected
+    with anna.page.expect_request("**/services", timeout=PATIENCE_S * 1e3):
+        http.start()
     expect(anna.link).to_have_text("● Connected")
+    expect(anna.stop).to_be_enabled()
+    expect(anna.plus).to_be_disabled()
+    asked[-1].abort()
+    anna.page.unroute("**/services")  # it asks again
     expect(anna.plus).to_be_enabled()
     jog(bench, anna, anna.plus)
     anna.page.mouse.up()

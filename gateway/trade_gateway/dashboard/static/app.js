@@ -34,7 +34,15 @@ let changed = 0;
 
 function onChange() {
   clearTimeout(changed);
-  changed = setTimeout(() => lookAround().catch((error) => tell(error.message)), 300);
+  changed = setTimeout(look, 300);
+}
+
+/** Until it succeeds, the controls of an earlier connection stay disabled. */
+function look() {
+  lookAround().catch((error) => {
+    tell(error.message);
+    if (gateway.connected) onChange();
+  });
 }
 
 function showConnection(connected) {
@@ -85,7 +93,7 @@ async function main() {
         readLog();
         readCalls();
       } else write($("log-problem"), "This needs the right to read the system (group trade).");
-      lookAround().catch((error) => tell(error.message));
+      look();
       await closed;
     } catch (error) {
       if (error.status === 401 || error.status === 403) {

@@ -14,6 +14,7 @@ const MOST_LEAD_S = 1; // longest lead of a goal over the measurement
 /** The device behind the services of a group, and its last measurement. */
 class Device {
   present = true; // on this page
+  outdated = false; // of an earlier connection, and about to be replaced
   state = null;
   limits = null;
   problem = "";
@@ -155,9 +156,9 @@ class Device {
   }
 
   paint() {
-    const jogs = this.limits && this.may(this.constructor.moved_by) && gateway.connected;
-    for (const jog of this.jogs) jog.let(jogs);
-    for (const [name, action] of this.actions) action.disabled = !(this.may(name) && gateway.connected);
+    const usable = gateway.connected && !this.outdated;
+    for (const jog of this.jogs) jog.let(this.limits && this.may(this.constructor.moved_by) && usable);
+    for (const [name, action] of this.actions) action.disabled = !(this.may(name) && usable);
     this.stopping.disabled = !gateway.connected;
     const { state } = this;
     const silent = this.problem || (state ? this.stale && "not heard of lately" : "no data yet");

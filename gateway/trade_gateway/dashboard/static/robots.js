@@ -112,9 +112,10 @@ function part(group, inside, sketched) {
   return make("section", { class: "part" }, alone ? null : title, sketches, make("ul", { class: "devices" }, ...inside.map((one) => one.element)));
 }
 
-/** Refresh everything after a new connection. */
+/** Refresh everything after a new connection. Until then, of what is shown only stops can be used. */
 export function forget() {
   shape = "";
+  for (const device of devices.values()) device.outdated = true;
 }
 
 $("speed").oninput = () => {
