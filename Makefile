@@ -39,18 +39,18 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 
 # Three tiers of tests, by what a test may use: tests/support/tiers.py. In the last two, what failed runs again at the end, alone.
 # Those of ALONE judge a bus by the 0.2 s that safety allows it, or keep both cores busy themselves: two at a time, a file each.
-# QUIET compares real-time threads with ordinary ones, and other tests run robots in real time: nothing beside it.
-ALONE := tests/system/peers/test_conformance.py $(foreach name,demo siege teleop recording upgrade,tests/system/test_$(name).py)
-QUIET := tests/bench/test_jitter.py
+# QUIET has nothing beside it: it compiles for minutes, and compares real-time threads with ordinary ones.
+ALONE := tests/system/peers/test_conformance.py $(foreach name,commissioning demo recording siege teleop transcript tutorials upgrade,tests/system/test_$(name).py)
+QUIET := tests/system/peers/test_rust.py tests/bench/test_jitter.py
 SYSTEM := $(RUN) pytest --rerun --durations=10 -m system
 
 test: $(UV) ## what decides whether a change lands: code, containers and zenoh within a process; 5 minutes on two cores
 	@$(RUN) pytest --durations=10 -n 4 --dist worksteal --hypothesis-profile ci -m "not realtime and not system" $(ARGS)
 
-test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 15 minutes
+test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 22 minutes
 	@$(RUN) pytest --rerun --real-time --durations=10 -n 4 --dist worksteal -m "realtime and not system" $(ARGS)
 
-test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 15 minutes (root)
+test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 25 minutes (root)
 	@failed=; part() { code=0; "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; *) failed=1 ;; esac; }; \
 	part $(SYSTEM) -n 4 --dist worksteal tests $(patsubst %,--ignore %,$(ALONE) $(QUIET)); \
 	part $(SYSTEM) -n 2 --dist loadfile $(ALONE); part $(SYSTEM) $(QUIET); test -z "$$failed"
