@@ -307,7 +307,7 @@ class Container:
     @property
     def catching_up(self) -> bool:
         """Whether it is requesting registry entries that it may have missed, or has yet to announce its own."""
-        return self._parts.watch.busy or not self._parts.announcer.is_introduced
+        return self._parts.watch.busy or not self._parts.announcer.introduced
 
     def healthy(self) -> bool:
         """Whether it can take a call now; code that feeds hardware watchdogs checks this."""

@@ -29,7 +29,8 @@ class Announcer:
         self._lock = threading.Lock()
         self._current: dict[str, bytes] = {}
         self._revision = 0
-        self._is_announced = False
+        self.introduced = False
+        """Whether announcements are sent."""
         self._quiet = 0
         """Beats since the last announcement."""
         self._questions = transport.questions(registry_key("*", own, "*"))
@@ -42,13 +43,8 @@ class Announcer:
         Raises:
             ChannelClosed: the transport was closed.
         """
-        self._is_announced = not self._transport.relayed
+        self.introduced = not self._transport.relayed
         return self._transport.appear(alive_key(self._own))
-
-    @property
-    def is_introduced(self) -> bool:
-        """Whether announcements are sent."""
-        return self._is_announced
 
     def introduce(self) -> None:
         """Announce all that there is, and the revision: who hears all of it needs no query.
@@ -57,7 +53,7 @@ class Announcer:
             ChannelClosed: the transport was closed.
         """
         with self._lock:
-            self._is_announced = True
+            self.introduced = True
             current, revision = list(self._current.items()), self._revision
         for key, payload in current:
             self._transport.announce(key, payload)
@@ -76,8 +72,8 @@ class Announcer:
                 self._current[key] = payload
             else:
                 self._current.pop(key, None)
-            is_announced = self._is_announced
-        if is_announced:
+            introduced = self.introduced
+        if introduced:
             self._transport.announce(key, payload)
 
     def beat(self, containers: int) -> None:
