@@ -66,8 +66,8 @@ class Resource:
     """
 
     __slots__ = (
-        *("_moving", "_on_rest", "calls", "coupled", "epoch", "estop", "session_error", "holder", "latch", "live"),
-        *("movers", "name", "why_ended", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses", "why"),
+        *("_moving", "_on_rest", "calls", "coupled", "epoch", "estop", "session_error", "holder", "last_stop", "latch"),
+        *("live", "movers", "name", "why_ended", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses", "why"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -86,6 +86,8 @@ class Resource:
         self.pending: Holder | None = None
         """The client that waits until its calls and motion have ended: no new call is admitted."""
         self.stops = 0
+        self.last_stop = ""
+        """Why it was stopped last."""
         self.latch: Latch | None = None
         self.estop: Latch | None = None
         self.why = ""
@@ -139,7 +141,7 @@ class Resource:
         used = self.holder is not None or self.busy or self.movers
         if stopping and used and not self._is_of(stopping):
             self.latch = Latch(by, reason, estop)  # first: a call admitted under the new number has seen it
-        self.why = reason
+        self.why = self.last_stop = reason
         self.stops = _stop_numbers()  # not += 1: one of two concurrent stops would be lost
 
     def _is_of(self, stopping: set[str]) -> bool:
@@ -274,7 +276,7 @@ class Permit(Struct, eq=False):
         for resource, live, stops in self.fences:
             if resource.stops != stops:
                 latch = resource.estop or resource.latch
-                reason = "it was stopped" if latch is None else f"{latch.by}: {latch.reason}"
+                reason = resource.last_stop if latch is None else f"{latch.by}: {latch.reason}"
                 raise MotionStopped(device=resource.name, reason=reason)
             if live and ((reason := resource.why_ended(live)) or resource.live != live):
                 raise lapsed(resource, reason)

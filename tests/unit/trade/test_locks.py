@@ -389,8 +389,8 @@ def test_S11_the_number_of_a_grant_must_match_exactly_and_a_greater_one_is_refus
 def test_S08_a_stop_voids_commands_admitted_before_it_whatever_the_locks(table: Table) -> None:
     token = table.take("a")
     admitted = table.call("a", [token])
-    table.resources["a"].stop("owner", ["s"])
-    with pytest.raises(MotionStopped):
+    table.resources["a"].stop("owner", ["s"], "its session ended")
+    with pytest.raises(MotionStopped, match="its session ended"):
         admitted.gate()
     table.call("a", [token], call_id=1).gate()
     table.resources["a"].stop("stranger", ["else"])
