@@ -4,6 +4,7 @@ import json
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -81,11 +82,12 @@ def test_a_container_started_on_a_full_disk_works_is_found_and_keeps_its_record_
     assert "may not find this one" in "".join(rosie.program.errors)
     disk.make_room()
 
-    def moves() -> int:
-        rows = trade_command("audit", "--json", "--container", "rosie", "--service", "*.move_to").stdout.splitlines()
-        return sum(json.loads(row)["outcome"] == "ok" for row in rows)
+    def rows(*words: str) -> list[dict[str, Any]]:
+        return [json.loads(row) for row in trade_command("audit", "--json", *words).stdout.splitlines()]
 
-    wait_until(lambda: moves() == 2)
+    moved = ("--container", "rosie", "--service", "*.move_to")
+    wait_until(lambda: sum(row["outcome"] == "ok" for row in rows(*moved)) == 2, "its moves are written")
+    wait_until(lambda: {row["container"] for row in rows()} == {"first", "late", "rosie"}, "all records are written")
     assert trade_command("audit", "verify").returncode == 0
 
 
