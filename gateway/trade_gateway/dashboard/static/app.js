@@ -32,16 +32,20 @@ async function keepAsking(look, every_ms) {
 
 let changed = 0;
 
-function onChange() {
+function lookIn(pause_ms) {
   clearTimeout(changed);
-  changed = setTimeout(look, 300);
+  changed = setTimeout(look, pause_ms);
+}
+
+function onChange() {
+  lookIn(300);
 }
 
 /** Until it succeeds, the controls of an earlier connection stay disabled. */
 function look() {
   lookAround().catch((error) => {
     tell(error.message);
-    if (gateway.connected) onChange();
+    if (gateway.connected) lookIn(ASK_AGAIN_MS);
   });
 }
 
