@@ -27,6 +27,8 @@ class QueuedBus(SocketCanDaemonBus):
     """The class of the errors that the controller reports while nothing is received (linux/can/error.h); 0: none."""
     full_every: ClassVar[int]
     """Of so many frames, one finds the queue full however idle the wire is; 0: none does."""
+    full_for: ClassVar[int]
+    """So many attempts to send from now on find the queue full."""
     offers: ClassVar[int]
     """Frames that the queue was to take."""
     refused: ClassVar[int]
@@ -45,7 +47,7 @@ class QueuedBus(SocketCanDaemonBus):
     @classmethod
     def reset(cls, length: int = 10, frame_s: float = 0.0) -> None:
         cls.length, cls.frame_s = length, frame_s
-        cls.stuck, cls.error, cls.full_every = False, 0, 0
+        cls.stuck, cls.error, cls.full_every, cls.full_for = False, 0, 0, 0
         cls.offers = cls.refused = 0
 
     def __init__(self, channel: str, **_: Any) -> None:
@@ -58,7 +60,9 @@ class QueuedBus(SocketCanDaemonBus):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._drain()
         type(self).offers += 1
-        if len(self._waiting) >= self.length or (self.full_every and self.offers % self.full_every == 0):
+        full = self.full_for > 0 or (self.full_every and self.offers % self.full_every == 0)
+        type(self).full_for = max(0, self.full_for - 1)
+        if full or len(self._waiting) >= self.length:
             type(self).refused += 1
             raise can.CanOperationError("Failed to transmit: No buffer space available", ENOBUFS)
         self._waiting.append(msg)
