@@ -84,6 +84,9 @@ def pool(channel: QueueChannel, calls: Calls) -> Iterator[QuickWorkerPool]:
     calls.may_end.set()
     made.close()
     made.wait(20)
+    for thread in threading.enumerate():
+        if thread.name.startswith("quick-"):  # one that left the pool by itself may be on its way out
+            thread.join(20)
     assert not any(thread.name.startswith("quick-") for thread in threading.enumerate())
 
 
